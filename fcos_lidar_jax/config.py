@@ -118,9 +118,9 @@ class ModelConfig:
     later rounds in its pixel."""
     background_prior: Between = 0.99  # Our choice: initial background probability.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
-    """Our choice: means subtracted from the nine channels in preprocessing."""
+    """Our choice: mean of each of ``types.CHANNELS``, subtracted in preprocessing, and of channels of your own."""
     channel_scale: Positives = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
-    """Our choice: scales by which the nine channels are divided in preprocessing."""
+    """Our choice: scale of each channel, by which it is divided in preprocessing."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -128,9 +128,10 @@ class ModelConfig:
         check(with_local, "round_offsets", self.round_offsets, "False without local_geometry")
         groups = max(1, min(32, self.head_channels // 2))  # Groups of the group norms, see models.layers.
         check(self.head_channels % groups == 0, "head_channels", self.head_channels, f"a multiple of {groups}")
-        for name in ("channel_mean", "channel_scale"):
-            nine = len(getattr(self, name)) == 9 and all(map(math.isfinite, getattr(self, name)))
-            check(nine, name, getattr(self, name), "nine finite numbers")
+        mean, scale = self.channel_mean, self.channel_scale
+        finite = all(map(math.isfinite, (*mean, *scale)))
+        check(finite and len(mean) >= 9, "channel_mean", mean, "nine or more finite numbers")
+        check(len(scale) == len(mean), "channel_scale", scale, f"{len(mean)} numbers, as many as channel_mean")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -328,6 +329,11 @@ class Config:
     def of(cls, other: "Config", **changes: Any) -> Self:
         """Create a configuration from the fields shared with another detector's configuration, with changes."""
         return cls(**{name: getattr(other, name) for name in _names(cls) & _names(other)} | changes)
+
+    def with_doubled_classes(self, **changes: Any) -> Self:
+        """Create a configuration with more classes, which shows the arrays that depend on their number."""
+        more = tuple(f"{name} again" for name in self.classes)
+        return dataclasses.replace(self, classes=self.classes + more, class_ranges_m=(), **changes)
 
     def build(self, sensor: Sensor) -> Any:
         """Build the :class:`fcos_lidar_jax.models.Detector` of a subclass; None for FCOS-LiDAR."""

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import ModelConfig
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import CHANNELS, Locations, RangeImage
+from fcos_lidar_jax.types import Locations, RangeImage
 
 STRIDES = (1, 2, 4, 8, 16, 32)  # Strides of P2 to P7 in the padded image.
 
@@ -128,6 +128,6 @@ def locate(image: RangeImage, layout: ImageLayout) -> Locations:
     0
     """
     cells = location_cells(layout)
-    first_round = image.features[..., 0].reshape(layout.rows * layout.columns, len(CHANNELS))
+    first_round = image.features[..., 0].reshape(layout.rows * layout.columns, -1)
     pixel = jnp.where((cells >= 0)[:, None], first_round[np.maximum(cells, 0)], 0.0)
     return Locations(pixel[:, :3], azimuth_rad=pixel[:, 4], cell=jnp.asarray(cells), occupied=pixel[:, 7] > 0)

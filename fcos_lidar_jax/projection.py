@@ -250,7 +250,7 @@ def project_points(
 
 def _gather_channels(
     points: Float32[Array, "n c"], polar: tuple[Float32[Array, "n"], ...], index: Int32[Array, "s r"]
-) -> Float32[Array, "s 9 r"]:
+) -> Float32[Array, "s _ r"]:
     """Channels of the winners in the order of ``types.CHANNELS``; zero in empty slots."""
     x, y, z, intensity, lag = (points[:, i] for i in range(5))
     filled = index >= 0

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float32, Int32
 
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
-"""The nine channel types of a range image (paper, section 3.1)."""
+"""The channel types of a range image (paper, section 3.1). Detectors may add their own at the end."""
 BOX = "x, y, z, l, w, h, yaw, ..."
 """Columns of boxes that functions need; more may follow."""
 ORIENTED = "x, y, z, l, w, h, cos yaw, sin yaw"
@@ -54,8 +54,8 @@ def check_rows(number: int, *, axes: int = 1, **arrays: Any) -> None:
 class RangeImage:
     """A multi-round range image (paper, sections 3.1 and 3.2)."""
 
-    features: Float32[Array, "*b h w 9 r"]
-    """Channels in the order of :data:`CHANNELS`, in raw units; all nine are zero in empty slots."""
+    features: Float32[Array, "*b h w c r"]
+    """Channels in the order of :data:`CHANNELS`, in raw units; all are zero in empty slots."""
     point_index: Int32[Array, "*b h w r"]  # Row of the input point in the slot, -1 where empty.
     num_dropped: Int32[Array, "*b"]
     """Valid input rows that were non-finite, beyond the sensor's limits or outside its field of view."""

@@ -38,8 +38,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # a process 
 
 
 # Most of the time goes to compilation, so programs are compiled without optimisation, except where the last bits
-# matter: in exported programs, projection and overlaps.
-_OPTIMISED = ("test_export", "test_projection", "test_iou")
+# matter: in exported programs and projection.
+_OPTIMISED = ("test_export", "test_projection")
 
 
 def _is_quick(path: Path) -> bool:

@@ -43,6 +43,7 @@ PAGES = [
 RUN_ELSEWHERE = {  # pages that have a test of their own, which goes on from what they make
     "own_data.md": "cli/test_own_data.py",
     "export.md": "inference/test_export.py",
+    "own_loop.md": "training/test_own_loop.py",
 }
 CORE = (
     *("sensors", "types", "config", "presets", "geometry", "projection", "locations"),

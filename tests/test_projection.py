@@ -376,17 +376,3 @@ def test_real_cloud_changes_under_permutation_only_where_keys_tie(real_cloud, cl
         assert set(np.flatnonzero(changed.ravel())) <= set(tied_cells.tolist())
         assert changed.sum() <= 20
         assert close == "none" or not differs[..., 0].any()
-
-
-@pytest.mark.real_data
-def test_real_cloud_is_bit_identical_under_jit_vmap_and_repetition(real_cloud):
-    valid = np.ones(len(real_cloud), bool)
-
-    def go(p):
-        return project_points(p, valid, NUSCENES_HDL32E, num_rounds=7)
-
-    plain = go(real_cloud)
-    assert_same(plain, go(real_cloud))
-    assert_same(plain, jax.jit(lambda p: go(p * 1.0))(real_cloud))
-    batched = jax.jit(jax.vmap(go))(np.stack([real_cloud[::-1], real_cloud]))
-    assert_same(plain, jax.tree.map(lambda leaf: leaf[1], batched))

@@ -1,7 +1,7 @@
 """Configuration of CenterPoint on pillars (Yin et al., CVPR 2021)."""
 
 import dataclasses
-from typing import Any
+from typing import Any, Self
 
 from fcos_lidar_jax.centerpoint.pillar_config import PillarConfig
 from fcos_lidar_jax.config import Config, LossConfig, ModelConfig
@@ -33,6 +33,10 @@ class CenterPointConfig(Config):
             check(own == default, f"loss.{name}", own, f"{default!r} with pillars, which do not use it")
         exponent = self.inference.iou_exponent
         check(exponent == 1, "inference.iou_exponent", exponent, "1 with pillars, which predict no IoU")
+
+    def with_doubled_classes(self, **changes: Any) -> Self:
+        doubled = dataclasses.replace(self.pillars, groups=2 * self.pillars.groups)
+        return super().with_doubled_classes(pillars=doubled, **changes)
 
     def build(self, sensor: Sensor) -> Any:
         """Build CenterPoint for the clouds of a sensor."""

@@ -87,7 +87,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
     # Replicated arrays are complete on every device.
     parts = jax.tree.map(lambda x: np.asarray(x.addressable_data(0) if isinstance(x, jax.Array) else x), parts)
-    for name, leaf in _by_name(parts).items():
+    for name, leaf in by_name(parts).items():
         if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
             raise NonFiniteStateError(f"{folder}: not saved: {name}: not finite")
     _check_space(folder, parts)
@@ -177,16 +177,17 @@ def read_state(folder: Path, like: TrainState) -> TrainState:
         raise CheckpointError(f"{folder}: found a detector without a training state, expected both")
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     loaded = _load_arrays(folder / _STATE, jax.eval_shape(_as_arrays, like), config)
-    state = jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _by_name(like, ".")])
+    state = jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in by_name(like, ".")])
     return dataclasses.replace(state, key=jax.random.wrap_key_data(state.key))
 
 
 def _as_arrays(state: TrainState) -> dict[str, Any]:
     """Leaves of the state by name, with the random key as raw data."""
-    return _by_name(dataclasses.replace(state, key=jax.random.key_data(state.key)), ".")
+    return by_name(dataclasses.replace(state, key=jax.random.key_data(state.key)), ".")
 
 
-def _by_name(tree: Any, separator: str = "/") -> dict[str, Any]:
+def by_name(tree: Any, separator: str = "/") -> dict[str, Any]:
+    """The leaves of a tree by their path."""
     leaves = jax.tree.leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator=separator): leaf for path, leaf in leaves}
 
@@ -317,7 +318,7 @@ def check_arrays(where: Path | str, expected: Any, found: Any, *, whose: str) ->
     Raises:
         CheckpointError: names the first difference.
     """
-    shapes, got = ({name: tuple(leaf.shape) for name, leaf in _by_name(t).items()} for t in (expected, found))
+    shapes, got = ({name: tuple(leaf.shape) for name, leaf in by_name(t).items()} for t in (expected, found))
     for name in sorted(shapes.keys() | got.keys()):
         if shapes.get(name) != got.get(name):
             difference = f"got {got.get(name, 'nothing')}, expected {shapes.get(name, 'nothing')}"

@@ -22,6 +22,9 @@ _LESS_MEMORY = (
     "for training, --optimizer.accumulate N splits each batch into N parts, --model.precision bfloat16 halves the "
     "activations, and --model.remat recomputes the largest ones; other commands need the least with --batch-size 1"
 )
+_PLATFORMS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
+_STRICT = ("JAX_TRANSFER_GUARD", "JAX_NO_EXECUTION", "JAX_DEBUG_", "JAX_CHECK_", "JAX_DISALLOW_", "JAX_NUMPY_")
+"""Beginnings of the variables by which JAX refuses, for debugging, what is usual."""
 _MAX_LINE = 1000
 _CLOSED_CONNECTION = "closed by peer|reset by peer|Broken pipe|Read error|Write error"
 _CLOSED_PIPE = 128 + signal.SIGPIPE
@@ -112,17 +115,32 @@ def _explain(error: Exception) -> str | None:
         return "nested too deeply: expected a file or an option with fewer levels"
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
         return f"out of memory: {_LESS_MEMORY}"
-    if isinstance(error, RuntimeError) and "nitialize backend" in text:
-        return (
-            f"JAX_PLATFORMS: got {os.environ.get('JAX_PLATFORMS')!r}, expected a platform of this machine: {text}"
-        )
+    if _lacks_platform(error):
+        name = next(filter(os.environ.get, _PLATFORMS), _PLATFORMS[0])
+        expected = 'a platform of this machine, or, for NVIDIA GPUs, pip install -U "jax[cuda13]"'
+        return f"{name}: got {os.environ.get(name)!r}, expected {expected}: {text}"
     if isinstance(error, RuntimeError) and "Gloo" in text:  # JAX's connection between processes on CPUs
         if "Gloo context initialization" not in text and re.search(_CLOSED_CONNECTION, text):
             return f"another process ended, see its output: {text}"
         return f"the connection between the processes failed: {text}"
-    if isinstance(error, ValueError | OSError | ArithmeticError):
+    is_expected = isinstance(error, ValueError | OSError | ArithmeticError)
+    strict = [f"{name}={value}" for name, value in os.environ.items() if name.startswith(_STRICT)]
+    if strict and (isinstance(error, FloatingPointError) or not is_expected):
+        return f"the environment has {', '.join(strict)}, which makes JAX refuse more than usual: {text}"
+    if is_expected:
         return text or f"{type(error).__name__} without a message"
     return None
+
+
+def _lacks_platform(error: Exception) -> bool:
+    """Whether JAX has no device of the platform that a variable of the environment names."""
+    if isinstance(error, AssertionError) and any(map(os.environ.get, _PLATFORMS)):
+        with contextlib.suppress(Exception):  # without CUDA's plugin, JAX has an assertion without a message
+            import jax
+
+            return not jax.devices()
+        return True
+    return isinstance(error, RuntimeError) and bool(re.search("nitialize backend|Unknown backend", str(error)))
 
 
 def _write_report(error: Exception) -> str:

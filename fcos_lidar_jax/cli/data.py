@@ -104,7 +104,7 @@ class DataOptions:
     ) -> FrameSet:
         """Open frames with the classes of the data; ``sensor`` is for formats that do not define one.
 
-        With ``report_missing`` a line on standard error counts the missing sweep files.
+        With ``report_missing`` a line on standard error counts the missing sweep files, if they may be missing.
         """
         data = self.data_set
         frames = open_frames(
@@ -118,7 +118,7 @@ class DataOptions:
             index=self.index if data.tables else None,
             **{name: getattr(self, name) for name in _PASSED_ON},
         )
-        if report_missing and isinstance(frames, NuScenesFrames):
+        if report_missing and self.allow_missing_sweeps and isinstance(frames, NuScenesFrames):
             number = frames.nuscenes.missing_sweeps(list(frames.tokens), reading.num_sweeps)
             if number:
                 tell(f"{number} sweep files of split {split!r} are missing")

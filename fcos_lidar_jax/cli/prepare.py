@@ -53,19 +53,23 @@ def run(args: Prepare) -> None:
     if not data.on_disk:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
     folder = args.data.index or data.index
-    check_out_folder(folder, "--index")
+    try:
+        check_out_folder(folder, "--index")
+    except PermissionError as error:
+        raise PermissionError(f"--index: {error}; name one by --index, here and for train") from None
     if belongs_to_own_data(folder / "objects"):
         raise ValueError(f"--index: {folder}: a folder of own data, expected another one")
     jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
+    split = _training_split(args, data)
+    tell(f"writing to {folder}" + ("" if args.data.index else "; --index names another folder"))
     with folder_lock(folder, "preparing"):
-        record = _prepare(args, data, folder)
+        record = _prepare(args, data, folder, split)
     record["seconds"] = round(time.monotonic() - began, 1)
     print(json.dumps(record))
 
 
-def _prepare(args: Prepare, data: DataSet, folder: Path) -> dict[str, Any]:
+def _prepare(args: Prepare, data: DataSet, folder: Path, split: str | None) -> dict[str, Any]:
     record: dict[str, Any] = {"folder": str(folder)}
-    split = _training_split(args, data)
     if data.tables is not None:
         index = _make_index(data.tables, folder)
         record |= {"scenes": len(index.scene_name), "keyframes": len(index.sample_token)}

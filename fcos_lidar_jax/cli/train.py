@@ -15,7 +15,7 @@ from fcos_lidar_jax.cli.checks import check_out_folder, option_name
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
-from fcos_lidar_jax.config import Config, RefinementConfig, config_to_json
+from fcos_lidar_jax.config import Config, RefinementConfig
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
@@ -25,7 +25,7 @@ from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import ABOUT, PRESETS
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training import Schedule, train
-from fcos_lidar_jax.training.plan import RUN_SPEC, check_run
+from fcos_lidar_jax.training.plan import RUN_SPEC, check_run, recorded_config
 from fcos_lidar_jax.training.run import run_folder
 
 _PRESETS: Any = (
@@ -105,7 +105,8 @@ def run(args: Train) -> None:
         with agreed("cannot train"):
             if task.cuts_objects and is_main_process:  # the other processes open the result
                 # A run with other frames or options keeps its objects.
-                cut_from = {"config": config_to_json(task.config), "objects": task.frames.fingerprint()}
+                config = recorded_config(task.config, task.frames)
+                cut_from = {"config": config, "objects": task.frames.fingerprint()}
                 check_run(args.out, json.loads(json.dumps(cut_from)), resume=resume)
                 with run_folder(args.out, resume=resume):
                     _cut_objects(args, task)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -118,7 +118,18 @@ class FolderFrames(FrameSet):
         current = self._current_sweep(index)
         return None if current is None else current.timestamp_us
 
+    def check_files(self, indices: Iterable[int]) -> None:
+        names = [self.names[index] for index in indices if self.reading.num_sweeps > 1]
+        for cloud, listed in ((self._clouds[name], self._sweeps[name]) for name in names if name in self._sweeps):
+            files = [sweep.file for sweep in read_list(listed)]
+            for i, file in enumerate(files):
+                _expect_file(listed.parent / file, self._inside, f"{listed}: $[{i}].file")
+            if (listed.parent / files[0]).resolve() != cloud.resolve():
+                expected = f"the frame's own cloud, '../clouds/{cloud.name}'"
+                raise ValueError(f"{listed}: $[0].file: got {files[0]!r}, expected {expected}")
+
     def fingerprint(self) -> str:
+        self.check_files(range(len(self)))
         listed = (file.parent / sweep.file for file in self._sweeps.values() for sweep in read_list(file))
         clouds = {os.path.normpath(file) for file in self._clouds.values()}
         older = {Path(path) for path in map(os.path.normpath, listed) if path not in clouds}
@@ -142,12 +153,7 @@ class FolderFrames(FrameSet):
             points = point_files.read_points(cloud, self.sensor)
             _expect_sweeps(points[:, 4], cloud)
             return drop_close(points, self.sensor, reading)
-        files = [sweep.file for sweep in read_list(listed)]
-        for i, file in enumerate(files):
-            _expect_file(listed.parent / file, self._inside, f"{listed}: $[{i}].file")
-        if (listed.parent / files[0]).resolve() != cloud.resolve():
-            expected = f"the frame's own cloud, '../clouds/{cloud.name}'"
-            raise ValueError(f"{listed}: $[0].file: got {files[0]!r}, expected {expected}")
+        self.check_files([index])
         return read_sweeps(listed, self.sensor, reading)
 
     def _annotation(self, index: int) -> tuple[np.ndarray, np.ndarray]:

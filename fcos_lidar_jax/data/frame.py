@@ -72,6 +72,9 @@ class FrameSet(Protocol):
         """Checksum of everything that determines the frames, as far as it is known without reading the points."""
         ...
 
+    def check_files(self, indices: Iterable[int]) -> None:
+        """Refuse missing point files of some frames, and links that must not be followed, before one is read."""
+
     def clouds_fingerprint(self, indices: Iterable[int]) -> str:
         """Checksum of the name, size and modification time of some frames' point files.
 
@@ -168,6 +171,9 @@ class WrappedFrames(FrameSet):
 
     def fingerprint(self) -> str:
         return self.frames.fingerprint()
+
+    def check_files(self, indices: Iterable[int]) -> None:
+        self.frames.check_files(map(self._source, indices))
 
     def clouds_fingerprint(self, indices: Iterable[int]) -> str:
         return self.frames.clouds_fingerprint(map(self._source, indices))

@@ -38,6 +38,7 @@ _FIELDS = (
     *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
+_TYPES = {name.lower(): name for name in (*CLASSES, "DontCare")}
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -213,22 +214,29 @@ def read_objects(file: Path, *, scored: bool = False) -> tuple[list[str], np.nda
     """All lines of a label or result file, DontCare too: types, and the numbers that follow them, f64[m, 15].
 
     The columns are truncation, occlusion, alpha, left, top, right, bottom, height, width, length, x, y, z,
-    rotation_y and score; the score is NaN where the line has none, which ``scored`` refuses.
+    rotation_y and score; the score is NaN where the line has none. Types in any case become KITTI's.
+
+    Result files (``scored``) need scores, and are read as by the development kit: other types stay as they are;
+    height to rotation_y of lines with a box in the image only, without a size or a position, are NaN.
     """
     lengths, expected = ((16,), "16, the score last") if scored else ((15, 16), "15, or 16 with a score")
     types, rows, places = [], [], []
     for where, words in read_lines(file):
         if len(words) not in lengths:
             raise ValueError(f"{where}: got {len(words)} values, expected {expected}")
-        if words[0] not in (*CLASSES, "DontCare"):
-            raise ValueError(f"{where}: type: {unknown_name(words[0], CLASSES)}")
+        kind = _TYPES.get(words[0].lower(), words[0])
+        if kind not in _TYPES.values() and not scored:
+            raise ValueError(f"{where}: type: {unknown_name(kind, CLASSES)}")
         named = zip(_FIELDS, words[1:], strict=False)
         rows.append([read_number(word, f"{where}: {name}") for name, word in named])
         rows[-1] += [np.nan] * (16 - len(words))
-        types.append(words[0])
+        types.append(kind)
         places.append(where)
     fields = np.array(rows, np.float64).reshape(-1, 15)
-    objects = np.flatnonzero(np.array(types, object) != "DontCare")
+    if scored:
+        flat = (fields[:, 7:10] <= 0).any(axis=1) | (fields[:, 10:13] == -1000).any(axis=1)
+        fields[flat, 7:14] = np.nan
+    objects = np.flatnonzero(np.isin(types, CLASSES) & ~np.isnan(fields[:, 7]))
     boxes = np.pad(fields[objects][:, [10, 11, 12, 9, 8, 7, 13]], ((0, 0), (0, 2)), constant_values=np.nan)
     check_boxes(boxes, lambda i: places[objects[i]])
     return types, fields

@@ -6,6 +6,9 @@ translate them into Python code.
 
 import contextlib
 import functools
+import heapq
+import itertools
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,13 +20,14 @@ from fcos_lidar_jax.data.drives import Drive, OutsidePosesError, PoseRow, PoseTr
 from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.frame_tree import FrameTree, printable
 from fcos_lidar_jax.data.pcd import find_columns
-from fcos_lidar_jax.data.point_files import MAX_POINTS, assemble_points
+from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, assemble_points
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.sensors import Sensor
 
 _CLOUD = ("sensor_msgs/msg/PointCloud2",)
 _POSE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_ENDINGS = (".bag", ".mcap", ".db3")
 _MAX_LISTED = 20  # topics listed in a message
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Datatype of a field -> NumPy's type."""
@@ -33,8 +37,18 @@ _PoseAt = Callable[[str, int, str], np.ndarray]
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder with ``metadata.yaml``."""
-    return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, a folder of them or with ``metadata.yaml``."""
+    return path.suffix in _ENDINGS or (path / "metadata.yaml").is_file() or _files(path) != [path]
+
+
+def _files(path: Path) -> list[Path]:
+    """What rosbags can open: the path, or the files of a folder whose metadata lack the format or are missing."""
+    files, metadata = sorted(path.iterdir()) if path.is_dir() else [], path / "metadata.yaml"
+    text = metadata.read_text(encoding="utf-8", errors="replace") if metadata in files else "relative_file_paths"
+    whole = "relative_file_paths" not in text or re.search(r"storage_identifier:\s*[\"']?\w", text)
+    if whole or any(file.name.endswith(ENDINGS) for file in files):
+        return [path]
+    return [file for file in files if file.suffix in _ENDINGS] or [path]
 
 
 def ros_bag_drive(
@@ -96,20 +110,22 @@ class _Bag(contextlib.AbstractContextManager):
             raise ValueError(f"{path}: rosbags is not installed, which reads recordings: {how}") from None
         if not path.exists():
             raise ValueError(f"{path}: no such file or folder, expected a recording")
-        self.path, self._is_ros1 = path, path.suffix == ".bag"
         files = [path, *path.iterdir()] if path.is_dir() else [path]
         if odd := [file for file in files if file.suffix == ".db3" and set("%?#") & set(str(file))]:
             raise ValueError(f"{printable(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")
-        with _refusing(str(path)):
-            self._reader: Any = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
-            self._reader.open()
+        with _refusing(str(path)), contextlib.ExitStack() as opened:
+            self.path, parts = path, _files(path)
+            self._is_ros1 = parts[0].suffix == ".bag"
+            kind: Any = rosbag1 if self._is_ros1 else rosbag2
+            self._readers = [opened.enter_context(kind.Reader(part)) for part in parts]
             self.counts = defaultdict[tuple[str, str], int](int)  # (topic, type) -> messages
-            for one in self._reader.connections:
+            for one in itertools.chain.from_iterable(reader.connections for reader in self._readers):
                 self.counts[str(one.topic), str(one.msgtype)] += int(one.msgcount)
+            self._opened = opened.pop_all()
 
     def __exit__(self, *error: object) -> None:
         with contextlib.suppress(Exception):
-            self._reader.close()
+            self._opened.close()
 
     def topics(self, types: tuple[str, ...]) -> list[str]:
         return sorted({topic for topic, kind in self.counts if kind in types})
@@ -133,8 +149,11 @@ class _Bag(contextlib.AbstractContextManager):
         raise ValueError(f"{self.path}: {option}: got {found}, expected a topic of {names} among: {topics}")
 
     def messages(self, topic: str, types: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-        connections = [one for one in self._reader.connections if one.topic == topic and one.msgtype in types]
-        raw, number = self._reader.messages(connections=connections), 0
+        sources, number = [], 0
+        for reader in self._readers:
+            if wanted := [one for one in reader.connections if one.topic == topic and one.msgtype in types]:
+                sources.append(reader.messages(connections=wanted))
+        raw = heapq.merge(*sources, key=lambda record: record[1])  # by time of recording
         while True:
             where = f"{self.path}: {printable(topic)}: message {number}"
             with _refusing(where):
@@ -240,7 +259,8 @@ def _parse_cloud(cloud: Any, where: str, sensor: Sensor, *, max_points: int) -> 
     width, height, step, pitch = cloud.width, cloud.height, cloud.point_step, cloud.row_step
     if width * height > max_points:
         raise ValueError(f"{where}: got {width} x {height} points, expected at most {max_points}")
-    pitch = max(pitch, width * step) if height <= 1 else pitch  # some drivers leave it 0 for a single row
+    if height <= 1 or len(cloud.data) == height * width * step:  # some drivers leave it 0, or count points
+        pitch = width * step
     if not width * height:
         return no_points(sensor)
     if pitch < width * step or len(cloud.data) < (height - 1) * pitch + width * step:

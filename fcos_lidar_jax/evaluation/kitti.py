@@ -1,5 +1,6 @@
 """KITTI's own metric: average precision at 40 recall positions, by overlap from above and in 3D."""
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.kitti import read_objects
+from fcos_lidar_jax.data.kitti import CLASSES, read_objects
 from fcos_lidar_jax.fields import unknown_name
 
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
@@ -35,13 +36,14 @@ def evaluate_kitti(
     detections therefore stay below 100, as in the development kit.
 
     Args:
-        results_dir: folder of files ``NAME.txt``, a detection per line, with a score.
+        results_dir: folder of files ``NAME.txt``, a detection per line, with a score, or of their folder ``data``.
         label_dir: folder of the label files of the same names, such as ``training/label_2``.
         classes: of :data:`MIN_OVERLAP`.
 
     Returns:
         ``{"metric": "AP_R40", "num_frames", "classes": {class: {"min_overlap", "num_truth", "bev", "3d"}}}``; the
-        last three by difficulty. An average precision without an object that counts is None.
+        last three by difficulty. An average precision without an object that counts is None. Also
+        ``"unknown_types": {type: lines}``, and ``"image_only"``, the number of detections without a box in 3D.
 
     Raises:
         ValueError: naming the file, the line and the field, what was found and what was expected.
@@ -57,13 +59,24 @@ def evaluate_kitti(
     for name in classes:
         if name not in MIN_OVERLAP:
             raise ValueError(f"classes: {unknown_name(name, MIN_OVERLAP)}")
-    files = sorted(Path(results_dir).glob("*.txt"))
+    files = sorted(results_folder(results_dir).glob("*.txt"))
     if not files:
         raise ValueError(f"{results_dir}: no .txt file in it, expected one for every frame")
     truth, found = _Objects([Path(label_dir) / file.name for file in files]), _Objects(files, scored=True)
+    flat = np.isnan(found.reach)[np.isin(found.types, CLASSES)]
+    if flat.all() and len(flat):
+        raise ValueError(f"{results_dir}: got boxes in the image only, expected height to rotation_y of 3D boxes")
     pairs, overlap = _overlapping(truth, found)
     scores = {name: _evaluate_class(name, truth, found, pairs, overlap) for name in classes}
-    return {"metric": "AP_R40", "num_frames": len(files), "classes": scores}
+    skipped = Counter(name for name in found.types.tolist() if name not in (*CLASSES, "DontCare"))
+    told = {"unknown_types": dict(sorted(skipped.items())), "image_only": int(flat.sum())}
+    return {"metric": "AP_R40", "num_frames": len(files), "classes": scores, **told}
+
+
+def results_folder(folder: str | Path) -> Path:
+    """The folder of the result files: ``data`` in the given one, if there are any, else the given one."""
+    inner = Path(folder) / "data"
+    return inner if any(inner.glob("*.txt")) else Path(folder)
 
 
 def describe_kitti(metrics: dict[str, Any]) -> str:
@@ -78,6 +91,10 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
     few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
     if few:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
+    if skipped := [f"{count} {name}" for name, count in metrics["unknown_types"].items()]:
+        lines.append(f"skipped, none of KITTI's types: {', '.join(skipped)}")
+    if metrics["image_only"]:
+        lines.append(f"without a box in 3D, and therefore false: {metrics['image_only']} detections")
     if metrics.get("left_out"):
         lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, WrappedFrames
 from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration
 from fcos_lidar_jax.evaluation.json_io import expect_samples
-from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, evaluate_kitti
+from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, evaluate_kitti, results_folder
 from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.geometry import wrap_angle
@@ -64,7 +64,7 @@ def write_kitti(out: Path, detections: Iterable[Detections], frames: FrameSet | 
 def score_kitti(results: Path, frames: KittiFrames, *, of: str) -> dict[str, Any]:
     """KITTI's metric of a folder of result files, one for each of the frames, which ``of`` describes."""
     names = [frames.name(index) for index in range(len(frames))]
-    expect_samples(sorted(file.stem for file in results.glob("*.txt")), names, str(results), of=of)
+    expect_samples(sorted(file.stem for file in results_folder(results).glob("*.txt")), names, str(results), of=of)
     return evaluate_kitti(results, frames.root / "training" / "label_2")
 
 

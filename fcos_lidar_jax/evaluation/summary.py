@@ -53,11 +53,12 @@ def full_summary(evaluation: Evaluation, meta: Mapping[str, Any]) -> dict[str, A
 
 
 def _curves(evaluation: Evaluation) -> dict[str, Any]:
-    """Curves behind the summary: precision by class and distance, errors by class and error."""
-    classes = {}
+    """Curves behind the summary, by class: number of objects, precision by distance, errors by error."""
+    classes, rankings = {}, dict(zip(evaluation.metric.classes, evaluation.rankings, strict=True))
     for name, defined in evaluation.summary["label_tp_errors"].items():
         curves = evaluation.curves[name]
         classes[name] = {
+            "num_truth": len(rankings[name].truth_sample),
             "precision": dict(zip(map(str, DISTANCES_M), curves.precision.tolist(), strict=True)),
             "confidence": dict(zip(map(str, DISTANCES_M), curves.confidence.tolist(), strict=True)),
             "errors": {e: v.tolist() for e, v in zip(TP_ERRORS, curves.errors, strict=True) if e in defined},

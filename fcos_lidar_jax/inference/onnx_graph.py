@@ -53,7 +53,7 @@ def cpu_package(name: str) -> Any:
 def network_graph(detector: TrainedDetector) -> bytes:
     """Convert the network of an FCOS-LiDAR detector to an ONNX file, deterministic for fixed versions.
 
-    The input is ``features`` f32[b, h, w, 9, r], a range image from ``project_points`` in raw units. The outputs
+    The input is ``features`` f32[b, h, w, c, r], a range image from ``project_points`` in raw units. The outputs
     are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. Everything is
     float32 regardless of ``config.model.precision``. A second look is not part of the graph. The metadata hold
     classes, configuration and sensor as JSON.
@@ -65,7 +65,7 @@ def network_graph(detector: TrainedDetector) -> bytes:
     layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
     network = _Network(onnx, without_second_look(detector.variables), circular=model.circular_width)
     image = _preprocessing(network, "features", model, layout)
-    stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
+    stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds, len(model.channel_mean)))
     levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks))
     k = len(config.classes)
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
@@ -78,7 +78,7 @@ def network_graph(detector: TrainedDetector) -> bytes:
     graph = onnx.helper.make_graph(
         network.nodes,
         config.name,
-        [described("features", float32, ["b", layout.rows, layout.columns, len(CHANNELS), rounds])],
+        [described("features", float32, ["b", layout.rows, layout.columns, len(model.channel_mean), rounds])],
         [described(name, float32, ["b", layout.num_locations, *shape]) for name, shape in shapes.items()],
         list(network.constants.values()),
     )
@@ -90,7 +90,7 @@ def network_graph(detector: TrainedDetector) -> bytes:
         ir_version=_IR_VERSION,
     )
     about = {
-        "channels": CHANNELS,
+        "channels": CHANNELS[: len(model.channel_mean)],
         "classes": detector.classes,
         "config": config_to_json(config),
         "sensor": sensor_to_json(detector.sensor),

@@ -7,17 +7,12 @@ tables, and detects altered tables and truncated files; altered points are detec
 """
 
 import dataclasses
-import multiprocessing
 import re
-import signal
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import msgspec
 import numpy as np
 
@@ -29,7 +24,7 @@ from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write, checksum, read_json
 from fcos_lidar_jax.progress import tell
-from fcos_lidar_jax.workers import end_with_parent
+from fcos_lidar_jax.workers import run_jobs
 
 MAX_SWEEPS = 20  # number of sweeps for which an object's points are counted
 
@@ -220,7 +215,7 @@ def prepare_database(
         (folder / _MANIFEST).unlink(missing_ok=True)
     report = report or (lambda done, total: None)
     report(done, len(frames))
-    for count in (_cut_shard(frames, job) for job in jobs) if workers == 1 else _pooled(frames, jobs, workers):
+    for count in run_jobs(_cut_shard, frames, jobs, workers):
         done += count
         report(done, len(frames))
     tables = {name: _read_shard(folder, name, columns) for name in shards}
@@ -321,39 +316,6 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # errors of tofile lack their errno
     atomic_write(table_file, lambda path: np.savez(path, allow_pickle=False, **table))
     return len(job.indices)
-
-
-def _pooled(frames: FrameSet, jobs: Sequence[_Job], workers: int) -> Iterator[int]:
-    number, context = min(workers, max(len(jobs), 1)), multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(number, mp_context=context, initializer=_begin_worker, initargs=(frames,))
-    try:
-        # The workers inherit the mask, so that only this process answers signals.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-        try:
-            futures = [pool.submit(_work, job) for job in jobs]
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for future in as_completed(futures):
-            yield future.result()
-    except BrokenProcessPool:
-        raise OSError("a worker died, perhaps out of memory: try fewer workers") from None
-    finally:  # even after an interruption, finish the shards in progress and start no other
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-_worker_frames: FrameSet | None = None
-
-
-def _begin_worker(frames: FrameSet) -> None:
-    global _worker_frames
-    _worker_frames = frames
-    jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
-    end_with_parent()
-
-
-def _work(job: _Job) -> int:
-    assert _worker_frames is not None
-    return _cut_shard(_worker_frames, job)
 
 
 def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None = None) -> _Table:

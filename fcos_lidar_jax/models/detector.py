@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import Config, ModelConfig
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.initialization import init_variables
 from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout, image_sensor, locate, pad_image
 from fcos_lidar_jax.models.candidates import select_candidates
@@ -78,7 +79,7 @@ class Network(nn.Module):
 
     def setup(self) -> None:
         c = self.config  # The attributes' names are the top level of the parameters.
-        self.stem = Stem(c.stem, c.circular_width, c.precision)
+        self.stem = Stem(c.stem, c.circular_width, c.precision, len(c.channel_mean))
         if c.local_geometry:
             normalisation = c.channel_mean, c.channel_scale
             self.local_geometry = LocalGeometry(
@@ -106,12 +107,14 @@ class Network(nn.Module):
             return self.heads(levels, local)
 
 
-def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, layout: ImageLayout) -> Image:
+def network_input(features: Float32[Array, "b h w c r"], config: ModelConfig, layout: ImageLayout) -> Image:
     """Preprocess range images: normalise, repeat rows, pad, and join channel types and rounds.
 
-    Empty slots stay zero in all nine channels. The ``9 r`` channels of the result are ordered by type, then by
-    round (paper, figure 2).
+    Empty slots stay zero in all channels. The ``c r`` channels of the result are ordered by type, then by round
+    (paper, figure 2).
     """
+    number = len(config.channel_mean)
+    check(features.shape[-2] == number, "features", features.shape, f"{number} channels, as in channel_mean")
     mean = jnp.array(config.channel_mean, jnp.float32)[:, None]
     scale = jnp.array(config.channel_scale, jnp.float32)[:, None]
     exists = features[..., 7:8, :] > 0
@@ -137,14 +140,18 @@ def _build(config: Config, sensor: Sensor) -> Detector:
     """FCOS-LiDAR without a second look."""
     network, layout = Network(config.model, len(config.classes)), image_layout(sensor, config.model)
     projection, sensor_of_image = config.projection, image_sensor(sensor, config.model)
+    kinds = len(config.model.channel_mean)
     options = {"num_rounds": projection.num_rounds, "prioritize_current": projection.prioritize_current}
 
     def prepare(points: Array | np.ndarray, valid: Array | np.ndarray) -> RangeImage:
         with jax.named_scope("mrv"):
-            return project_points(points, valid, sensor_of_image, **options)
+            image = project_points(points, valid, sensor_of_image, **options)
+        # A detector may be older than the last channels.
+        features = image.features if kinds >= len(CHANNELS) else image.features[:, :, :kinds]
+        return dataclasses.replace(image, features=features)
 
     def init(key: Any) -> Variables:
-        image = jax.ShapeDtypeStruct((1, 32, 32, len(CHANNELS) * projection.num_rounds), jnp.float32)
+        image = jax.ShapeDtypeStruct((1, 32, 32, kinds * projection.num_rounds), jnp.float32)
         plain = Network(dataclasses.replace(config.model, remat=False), len(config.classes))  # the same variables
         return init_variables(plain, key, image)
 

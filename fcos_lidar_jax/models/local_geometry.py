@@ -37,8 +37,8 @@ def local_offsets(
     """Compute the offsets between the first-round points of each pixel and its neighbours in a 3 x 7 window.
 
     Args:
-        image: the network's normalised input with ``9 r`` channels, ordered by type.
-        mean, scale: normalisation of the nine channels.
+        image: the network's normalised input, with r rounds of each channel, ordered by type.
+        mean, scale: normalisation of the channels.
         circular: wrap the window around the width; otherwise there are no neighbours beyond the image.
 
     Returns:
@@ -51,7 +51,7 @@ def local_offsets(
     >>> (100 * offsets[0, 0, 0, 40:44]).round().tolist()  # from the left pixel to its right neighbour
     [88.0, 0.0, 0.0, 100.0]
     """
-    first = image[..., :: image.shape[-1] // 9]
+    first = image[..., :: image.shape[-1] // len(mean)]
     points, exists = _points(first, scale)
     turned = _turning(first[..., 4] * scale[4] + mean[4])
     height, width = image.shape[1:3]
@@ -74,8 +74,8 @@ def round_offsets(image: Image, *, mean: tuple[float, ...], scale: tuple[float, 
     """Compute the offsets from the first-round point of each pixel to its points of the later rounds.
 
     Args:
-        image: the network's normalised input with ``9 r`` channels, ordered by type.
-        mean, scale: normalisation of the nine channels.
+        image: the network's normalised input, with r rounds of each channel, ordered by type.
+        mean, scale: normalisation of the channels.
 
     Returns:
         f[b, h, w, 5 (r - 1)]: for each later round the radial, tangential and vertical offset as in
@@ -88,7 +88,7 @@ def round_offsets(image: Image, *, mean: tuple[float, ...], scale: tuple[float, 
     >>> (100 * offsets[0, 0, 0]).round().tolist()
     [88.0, 0.0, 0.0, 0.0, 100.0]
     """
-    rounds = image.shape[-1] // 9
+    rounds = image.shape[-1] // len(mean)
     first = image[..., ::rounds]
     points, exists = _points(first, scale)
     turned, channels = _turning(first[..., 4] * scale[4] + mean[4]), []
@@ -116,12 +116,12 @@ def _turning(azimuth: jax.Array) -> Callable[..., tuple[jax.Array, ...]]:
     return turned
 
 
-def own_numbers(image: Image) -> Image:
+def own_numbers(image: Image, num_channels: int) -> Image:
     """Select height, range, inclination, intensity and existence of each pixel's first-round point.
 
     Channels that depend on the azimuth are left out: an object looks the same in every direction from the sensor.
     """
-    return image[..., :: image.shape[-1] // 9][..., np.array(OWN)]
+    return image[..., :: image.shape[-1] // num_channels][..., np.array(OWN)]
 
 
 class LocalGeometry(nn.Module):
@@ -136,7 +136,7 @@ class LocalGeometry(nn.Module):
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
         offsets = local_offsets(image, mean=self.mean, scale=self.scale, circular=self.circular)
-        parts = [offsets, own_numbers(image)]
+        parts = [offsets, own_numbers(image, len(self.mean))]
         if self.later_rounds:
             parts.append(round_offsets(image, mean=self.mean, scale=self.scale))
         x = jnp.concatenate(parts, axis=-1)

@@ -14,23 +14,23 @@ from fcos_lidar_jax.models.convolution import FULL, Image, Kernel, convolve, poi
 from fcos_lidar_jax.models.layers import BatchNorm, pieces
 from fcos_lidar_jax.types import CHANNELS
 
-_MODALITIES = (3, 3, 1, 1, 1)
-"""Channel types per modality: (x, y, z), (range, azimuth, inclination), intensity, existence, time lag."""
+_VECTORS = (3, 3)
+"""Channel types of the first modalities, (x, y, z) and (range, azimuth, inclination). The others have one each."""
 _WIDE = 24
 """Output channels below which separate convolutions cost more than one block-diagonal convolution."""
 
 
-def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]:
-    """List (input channels, output channels) of each group of the first convolution.
+def channel_groups(config: StemConfig, num_rounds: int, number: int = len(CHANNELS)) -> list[tuple[int, int]]:
+    """List (input channels, output channels) of each group of the first convolution, for ``number`` channel types.
 
     >>> channel_groups(StemConfig(groups="modalities"), 5)
     [(15, 96), (15, 96), (5, 32), (5, 32), (5, 32)]
     """
     width = config.channels_per_type
     if not config.group_rounds:
-        return [(1, width // num_rounds)] * (len(CHANNELS) * num_rounds)
-    number = len(CHANNELS)
-    types = {"types": (1,) * number, "modalities": _MODALITIES, "all": (number,)}[config.groups]
+        return [(1, width // num_rounds)] * (number * num_rounds)
+    modalities = *_VECTORS, *(1,) * (number - sum(_VECTORS))
+    types = {"types": (1,) * number, "modalities": modalities, "all": (number,)}[config.groups]
     return [(count * num_rounds, count * width) for count in types]
 
 
@@ -101,7 +101,7 @@ class ModalityBranch(nn.Module):
 class Stem(nn.Module):
     """Parallel modality-wise branches, merged by 1x1 convolutions and summed.
 
-    The input is a normalised image with ``9 r`` channels, ordered by type.
+    The input is a normalised image with ``number r`` channels, ordered by type.
 
     Groups have independent convolutions, of which narrow ones are joined by block-diagonal kernels.
     ``feature_group_count`` is slow on CPUs, and if a batch is split over devices XLA gathers its images on each of
@@ -111,11 +111,12 @@ class Stem(nn.Module):
     config: StemConfig
     circular: bool = False
     precision: str = "float32"
+    number: int = len(CHANNELS)  # Channel types.
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
-        config, num_rounds = self.config, image.shape[-1] // 9
-        groups = channel_groups(config, num_rounds)
+        config = self.config
+        groups = channel_groups(config, image.shape[-1] // self.number, self.number)
         sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups)]
         parts = [image[..., cut] for cut in pieces(sizes)]
         merged = jnp.zeros((), image.dtype)  # The sum over all groups has the image's precision.

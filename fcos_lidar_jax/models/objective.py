@@ -17,7 +17,7 @@ from fcos_lidar_jax.config import Config, LossConfig
 from fcos_lidar_jax.iou import oriented, oriented_iou_3d
 from fcos_lidar_jax.locations import ImageLayout, image_layout, locate
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import CHANNELS, Batch, Locations, Outputs, RangeImage, Sums, Targets
+from fcos_lidar_jax.types import Batch, Locations, Outputs, RangeImage, Sums, Targets
 
 _REGRESSION = ("l1", "iou", "iou_prediction")  # the paper's losses of the locations that regress a box
 
@@ -27,7 +27,7 @@ def location_owners(image: RangeImage, locations: Locations, boxes: Array, box_v
 
     Each cell of the sensor's image is tested once: repeated rows and coarser levels have the same points.
     """
-    first = image.features[..., 0].reshape(-1, len(CHANNELS))
+    first = image.features[..., 0].reshape(-1, image.features.shape[-2])
     cell_owner = owners(first[:, :3], first[:, 7] > 0, boxes, box_valid)
     owner = cell_owner[jnp.maximum(locations.cell, 0)]
     return jnp.where(locations.occupied, owner, -1)

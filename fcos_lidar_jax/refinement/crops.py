@@ -60,14 +60,14 @@ def crop_points(
     half = jnp.minimum(boxes[:, 3:6], limit_m) / 2 + margin_m
     frame = jnp.cos(boxes[:, 6]), jnp.sin(boxes[:, 6])
 
-    def add_bit(words: Array, rows: Array) -> tuple[Array, None]:
-        local = _to_frame([rows[None, :, i] for i in range(3)], boxes[:, None], [f[:, None] for f in frame])
-        inside = jnp.stack([jnp.abs(d) < half[:, None, i] for i, d in enumerate(local)]).all(axis=0)
-        return (words >> 1) | (inside.astype(jnp.uint32) << (_WORD - 1)), None
-
-    # Bit b of word w tells whether row 32 w + b is inside: a bit per point is faster to count than a byte.
+    # Bit b of word w tells whether row 32 w + b is inside: a bit per point is faster to count than a byte. Words
+    # are the last axis, so that XLA tests and packs many of them at once.
     position = jnp.where(usable[:, None], points[:, :3], _FAR_M).reshape(num_words, _WORD, 3)
-    words, _ = lax.scan(add_bit, jnp.zeros((len(boxes), num_words), jnp.uint32), position.swapaxes(0, 1))
+    bit_major = [position[..., i].T for i in range(3)]
+    local = _to_frame(bit_major, boxes[:, None, None], [f[:, None, None] for f in frame])
+    within = [jnp.abs(d) < half[:, None, None, i] for i, d in enumerate(local)]
+    inside = within[0] & within[1] & within[2]  # not a stack of three, which XLA would write to memory
+    words = (inside.astype(jnp.uint32) << lax.iota(jnp.uint32, _WORD)[:, None]).sum(axis=1, dtype=jnp.uint32)
     row, count = _first_set_bits(words, num_points)
     taken = jnp.arange(num_points) < count[:, None]
     row = jnp.where(taken, row, 0)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import optax
 
@@ -58,6 +59,13 @@ def make_optimizer(config: OptimizerConfig, num_steps: int) -> optax.GradientTra
 
 
 def current_hyperparameters(opt_state: Any) -> dict[str, Any]:
-    """Learning rate and b1 of the last update, from the state of :func:`make_optimizer`."""
-    hyperparameters = opt_state[1].hyperparams
-    return {name: hyperparameters[name] for name in ("learning_rate", "b1")}
+    """Hyperparameters of the last update, from every ``optax.inject_hyperparams`` in the state of an optimizer.
+
+    Names begin with the keys of the dicts around them, such as the labels of ``optax.partition``.
+    """
+    nodes = jax.tree.leaves_with_path(opt_state, is_leaf=lambda node: hasattr(node, "hyperparams"))
+    return {
+        "/".join([*(key.key for key in path if isinstance(key, jax.tree_util.DictKey)), name]): value
+        for path, node in nodes
+        for name, value in getattr(node, "hyperparams", {}).items()
+    }

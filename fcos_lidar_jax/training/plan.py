@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from jax.sharding import Mesh
 
 from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
-from fcos_lidar_jax.checkpoints.storage import CheckpointError, check_arrays, read_checkpoint
+from fcos_lidar_jax.checkpoints.storage import by_name, check_arrays, read_checkpoint
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
@@ -30,7 +31,7 @@ from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_optio
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.refinement import SECOND_LOOK, without_second_look
-from fcos_lidar_jax.sensors import sensor_to_json, turn_between
+from fcos_lidar_jax.sensors import Sensor, sensor_to_json, turn_between
 from fcos_lidar_jax.training.loop import Record
 from fcos_lidar_jax.training.metrics_log import METRICS, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
@@ -152,6 +153,8 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     config, frames = spec.config, spec.frames
     order = SampleOrder(frames, config, seed=spec.seed)
     check_counts(frames)
+    for read in filter(None, (frames, spec.tests)):
+        read.check_files(range(len(read)))
     check_batch_size(config.optimizer.batch_size, mesh)
     options = {"threads": spec.threads, "workers": spec.workers, "num_processes": jax.process_count()}
     check_loader_options(config, **options)
@@ -182,7 +185,7 @@ def _check_pasting(spec: RunSpec, epoch_steps: int) -> None:
 def _record(spec: RunSpec, detector: Detector, weights: Variables | None) -> dict[str, Any]:
     objects, tests = spec.objects, spec.tests
     record = {
-        "config": config_to_json(spec.config),
+        "config": recorded_config(spec.config, spec.frames),
         "sensor": sensor_to_json(spec.frames.sensor),
         "steps": spec.steps,
         "seed": spec.seed,
@@ -195,6 +198,11 @@ def _record(spec: RunSpec, detector: Detector, weights: Variables | None) -> dic
         "weights_hash": None if weights is None else TrainedDetector(detector, weights).fingerprint,
     }
     return json.loads(json.dumps(record))
+
+
+def recorded_config(config: Config, frames: FrameSet) -> dict[str, Any]:
+    """The configuration of a run as JSON, with the sensor of the data."""
+    return config_to_json(config) | {"sensor": frames.sensor.name}
 
 
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
@@ -250,23 +258,28 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
         return jax.tree.map(lambda expected, leaf: jnp.asarray(leaf, expected.dtype), shapes, weights)
     folder = find_checkpoint(Path(weights))
     checkpoint = read_checkpoint(folder)
-    classes, expected = checkpoint.config.classes, detector.config.classes
-    if classes != expected:
-        raise CheckpointError(f"{folder}: classes: got {classes}, expected the classes to be trained, {expected}")
     variables = _with_second_look(folder, checkpoint.variables, detector)
+    if (classes := checkpoint.config.classes) != detector.config.classes:
+        variables = _for_other_classes(folder, classes, variables, detector)
     check_arrays(folder, shapes, variables, whose=whose)
     own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
     for name, was, now in _differences(own, new, "model"):
         tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
-    if turn := turn_between(detector.sensor, checkpoint.sensor):
-        told = f"weights trained on clouds rotated by {math.degrees(turn):g} degrees relative to these"
-        tell(f"{folder}: {told}: expect scores to fall at first")
-    was, now = checkpoint.sensor.origin_m, detector.sensor.origin_m
-    if was != now:
-        tell(
-            f"{folder}: weights trained with the LiDAR at {was} m, here at {now} m: expect scores to fall at first"
-        )
+    for line in _sensor_differences(checkpoint.sensor, detector.sensor):
+        tell(f"warning: {folder}: weights trained {line}: expect scores to fall at first")
     return variables
+
+
+def _sensor_differences(was: Sensor, now: Sensor) -> Iterator[str]:
+    """What weights trained with one sensor have to learn of another."""
+    beams = [(s.inclinations_rad, s.num_columns, s.azimuth_limits_rad, s.row_source) for s in (was, now)]
+    if beams[0] != beams[1]:
+        names = [f"sensor {s.name!r} ({s.num_rows} beams, {s.num_columns} columns)" for s in (was, now)]
+        yield f"for {names[0]}, here {names[1]}: the arrays fit, but not the beams"
+    if turn := turn_between(now, was):
+        yield f"on clouds rotated by {math.degrees(turn):g} degrees relative to these"
+    if was.origin_m != now.origin_m:
+        yield f"with the LiDAR at {was.origin_m} m, here at {now.origin_m} m"
 
 
 def _with_second_look(where: Path, variables: Variables, detector: Detector) -> Variables:
@@ -280,6 +293,21 @@ def _with_second_look(where: Path, variables: Variables, detector: Detector) -> 
     tell(f"{where}: has no second look: it starts with random weights")
     new = jax.jit(detector.init)(jax.random.key(0))["params"][SECOND_LOOK]
     return variables | {"params": params | {SECOND_LOOK: new}}
+
+
+def _for_other_classes(where: Path, was: Sequence[str], variables: Variables, detector: Detector) -> Variables:
+    """Variables with random arrays where an array depends on the number of classes or does not fit."""
+    doubled = build_detector(detector.config.with_doubled_classes(), detector.sensor)
+    new, more = jax.jit(detector.init)(jax.random.key(0)), jax.eval_shape(doubled.init, jax.random.key(0))
+    found, own, more = (by_name(tree) for tree in (variables, new, more))
+    fits = {n for n, x in own.items() if n in found and found[n].shape == x.shape == more[n].shape}
+    if not fits:  # the weights of another detector, which are refused
+        return variables
+    totals, anew = (Counter(name.split("/")[1] for name in names) for names in (own, own.keys() - fits))
+    told = ", ".join(f"{part} ({anew[part]} of {totals[part]} arrays)" for part in sorted(anew))
+    tell(f"{where}: weights for other classes ({', '.join(was)}): these start with random weights: {told}")
+    leaves = [found[name] if name in fits else leaf for name, leaf in own.items()]
+    return jax.tree.unflatten(jax.tree.structure(new), leaves)
 
 
 def _differences(was: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:

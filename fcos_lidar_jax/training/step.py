@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from fcos_lidar_jax.augment import augment, sample_key
@@ -20,12 +21,13 @@ from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objec
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
 from fcos_lidar_jax.types import Batch, Sums, TrainState, check_rows
 
+Optimizer = optax.GradientTransformation | optax.MultiSteps
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
 def make_state(
     detector: Detector,
-    optimizer: optax.GradientTransformation,
+    optimizer: Optimizer,
     key: jax.Array,
     *,
     variables: Variables | None = None,
@@ -124,13 +126,17 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
     return gradient
 
 
-def make_train_step(detector: Detector, optimizer: optax.GradientTransformation) -> TrainStep:
+def make_train_step(detector: Detector, optimizer: Optimizer) -> TrainStep:
     """Make a training step: augment unless ``config.augment`` is None, predict, differentiate, update.
+
+    Args:
+        detector: the detector; replace its functions to change the loss or the network's input.
+        optimizer: any optimizer of optax. Its update also gets the loss, as ``value``.
 
     Returns:
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller.
-        Metrics are scalars except ``positives_per_level`` i32[6]. Raises a ValueError at trace time if the arrays
-        of the batch have different numbers of samples or boxes.
+        Metrics are scalars except ``positives_per_level`` i32[6], with hyperparameters of the optimizer. Raises
+        a ValueError at trace time if the arrays of the batch have different numbers of samples or boxes.
 
     >>> from fcos_lidar_jax.inference import load_trained
     >>> from fcos_lidar_jax.training import make_optimizer
@@ -145,6 +151,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
     """
     config, sensor = detector.config, detector.sensor
     gradient = make_gradient(detector)
+    update = optax.with_extra_args_support(optimizer).update  # type: ignore[arg-type]
     decay = config.optimizer.ema_decay
 
     def augmented(state: TrainState, batch: Batch) -> Batch:
@@ -162,9 +169,10 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         batch = augmented(state, batch)
         grads, batch_stats, metrics = gradient(state.params, state.batch_stats, batch)
         part = trainable(state.params, config)
-        updates, opt_state = optimizer.update(grads, state.opt_state, part)
+        updates, opt_state = update(grads, state.opt_state, part, value=metrics["loss/total"])
         params = state.params | optax.apply_updates(part, updates)
-        metrics["gradient_norm"] = optax.tree.norm(grads)
+        # The norm of one vector, as in the optimizer: a norm per leaf takes hundreds of small programs to compile.
+        metrics["gradient_norm"] = optax.tree.norm(ravel_pytree(grads)[0])
         metrics.update(current_hyperparameters(opt_state))
         ema = state.ema
         if ema is not None:

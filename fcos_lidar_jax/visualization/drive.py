@@ -15,7 +15,7 @@ from fcos_lidar_jax.visualization.bev import bev_on, class_legend
 from fcos_lidar_jax.visualization.evaluation_report import Example
 from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set_title
 
-_SIZE_IN = (8.0, 9.6)
+_SIZE_IN = (8.6, 9.6)
 _DPI = 90
 _SCENE_S = 0.5  # duration of each scene
 _COLORS = 96  # colours of the GIF; more colours increase its size but hardly its quality
@@ -81,7 +81,7 @@ def _draw_ranges(axis: Any, points: np.ndarray, size: int, sensor: Sensor) -> No
         ranges = np.roll(ranges, sensor.num_columns // 4, axis=1)
     else:
         right, left = 90 - np.degrees(sensor.azimuth_limits_rad)
-    axis.imshow(
+    picture = axis.imshow(
         ranges,
         cmap=mpl.colormaps["viridis_r"].with_extremes(bad=EMPTY),
         norm=LogNorm(2, sensor.limit_xy_m),
@@ -89,6 +89,9 @@ def _draw_ranges(axis: Any, points: np.ndarray, size: int, sensor: Sensor) -> No
         interpolation="nearest",
         extent=(left, right, sensor.num_rows, 0),
     )
+    bar = axis.figure.colorbar(picture, ax=axis, pad=0.01, extend="both", ticks=[2, 5, 10, 20, 50], format="%g")
+    bar.ax.minorticks_off()
+    bar.set_label("range [m]", fontsize=9)
     names = {-180: "behind", -90: "left", 0: "ahead", 90: "right", 180: "behind"}
     ticks = [degrees for degrees in names if left <= degrees <= right]
     axis.set_xticks(ticks, [names[degrees] for degrees in ticks], fontsize=9)

@@ -103,6 +103,7 @@ def write_evaluation_report(
     rows = [
         (
             _words(name),
+            curves["classes"][name]["num_truth"],
             summary["mean_dist_aps"][name],
             *(aps[distance] for distance in distances),
             *(summary["label_tp_errors"][name].get(error, float("nan")) for error in defined),
@@ -117,7 +118,7 @@ def write_evaluation_report(
         links=links,
         summary=_scores(summary, intervals, defined),
         tables=[
-            ("By class", ("class", "AP", *(f"AP {float(d):g} m" for d in distances), *short), rows),
+            ("By class", ("class", "objects", "AP", *(f"AP {float(d):g} m" for d in distances), *short), rows),
             *_kitti_table(out / KITTI_SUMMARY),
         ],
         galleries=[("Precision over recall", precisions), ("Mean errors of the hits, up to each recall", errors)],
@@ -243,16 +244,17 @@ def _draw_examples(
         points, kind = example.points, example.kind
         view, image, photo = (folder / f"{kind}_{name}.png" for name in ("bev", "range", "camera"))
         boxes = {"classes": list(ranges_m), "truth": example.truth, "detections": example.detections}
-        draw_bev(points, view, limit_m=max(ranges_m.values()) + _MARGIN_M, **boxes)
+        title, limit_m = f"{kind} sample: {example.name}", max(ranges_m.values()) + _MARGIN_M
+        draw_bev(points, view, title=title, limit_m=limit_m, **boxes)
         shown = f"detections of score {SHOWN_SCORE:g} and more, truth dashed"
         caption = f"The {kind} sample by hits and misses at 2 m ({example.name}): {shown}."
         views.append((caption, view))
         if example.camera is not None:
             draw_camera(example.camera[0], photo, example.camera[1], **boxes)
-            images.append((f"The {kind} sample's camera image.", photo))
+            images.append((f"The {kind} sample's camera image ({example.name}).", photo))
         if len(points):
             projected = project_points(points, np.ones(len(points), bool), sensor, num_rounds=1)
-            draw_range_image(projected, image, azimuth_limits_rad=sensor.azimuth_limits_rad, **boxes)
+            draw_range_image(projected, image, title=title, azimuth_limits_rad=sensor.azimuth_limits_rad, **boxes)
             images.append((f"The {kind} sample's range image: truth above, detections below.", image))
     return views, images
 

@@ -18,6 +18,7 @@ _CLASS_COLORS = (
     *("#e377c2", "#17becf", "#2ca02c", "#ff6f00", "#5b5b5b"),
 )
 _LABEL_POINTS = 7.0
+_BEST = 10  # boxes whose labels may cover other boxes
 _FEW = 40  # curves up to this length get markers, without which a single point is invisible
 _GOLDEN = 0.6180339887  # hue step, the golden ratio, for which hues never repeat
 
@@ -72,6 +73,8 @@ def write_labels(
 ) -> None:
     """Write class and score beside boxes where there is room, else the score, best first; without room nothing.
 
+    Labels do not cover each other. Only those of the best ten may cover other boxes.
+
     Args:
         boxes: centre and half the size in units of the axis, f64[2], label, and score, None for the truth.
         point: width and height of a typographic point in units of the axis.
@@ -79,18 +82,25 @@ def write_labels(
     from matplotlib.patheffects import withStroke
 
     low, high = np.sort([axis.get_xlim(), axis.get_ylim()]).T
-    placed: list[tuple[np.ndarray, np.ndarray]] = []
-    for centre, reach, label, score in sorted(boxes, key=lambda box: -(box[3] or 0)):
+    ranked = sorted(boxes, key=lambda box: -(box[3] or 0))
+    covered = np.array([box[:2] for box in ranked], np.float64).reshape(-1, 2, 2)  # of the boxes
+    placed = np.zeros((0, 2, 2))  # of the labels
+
+    def is_free(place: np.ndarray, half: np.ndarray, taken: np.ndarray) -> bool:
+        return bool((np.abs(place - taken[:, 0]) > half + taken[:, 1]).any(axis=1).all())
+
+    for rank, (centre, reach, label, score) in enumerate(ranked):
         name, number = classes[label].replace("_", " "), "" if score is None else f"{score:.2f}"
+        others = np.delete(covered, rank, axis=0)
         for text in filter(None, (f"{name} {number}".strip(), number)):
             half = np.array([_text_width(text, _LABEL_POINTS) / 2 + 1.5, 0.7 * _LABEL_POINTS]) * point
             beside = [centre + (reach + half) * side for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
             inside = [p for p in beside if (p - half > low).all() and (p + half < high).all()]
-            free = [p for p in inside if all((np.abs(p - q) > half + other).any() for q, other in placed)]
-            if free:
-                placed.append((free[0], half))
+            free = [p for p in inside if is_free(p, half, placed)]
+            if chosen := [p for p in free if is_free(p, half, others)] or (free if rank < _BEST else []):
+                placed = np.concatenate([placed, [[chosen[0], half]]])
                 style = {"fontsize": _LABEL_POINTS, "color": class_color(label), "zorder": 6}
-                written = axis.text(*free[0], text, ha="center", va="center", parse_math=False, **style)
+                written = axis.text(*chosen[0], text, ha="center", va="center", parse_math=False, **style)
                 written.set_path_effects([withStroke(linewidth=2, foreground="white")])
                 break
 

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_peer import CONFIG
-from tiny_run import SENSOR
+from tiny_run import SENSOR, untrained
 
 from fcos_lidar_jax.centerpoint.network import Neck, from_channels
-from fcos_lidar_jax.centerpoint.pillars import make_pillars, pillar_grid
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, CENTERPOINT_PILLARS, COMPACT
@@ -87,17 +86,16 @@ def test_each_class_is_predicted_by_its_group():
     groups = (0, 1, 0, 2, 1, 0, 2, 1, 0, 1)
     config = dataclasses.replace(CONFIG, pillars=dataclasses.replace(CONFIG.pillars, groups=groups))  # type: ignore[type-var]
     detector = build_detector(config, SENSOR)
-    variables = jax.jit(detector.init)(jax.random.key(0))
+    variables = untrained(config, SENSOR)
     heads = variables["params"]["heads"]
     for group in range(3):  # nothing but the biases
         for name in ("heat", "offset", "height", "size", "heading", "velocity"):
             part = heads[f"group{group}_{name}"]
             part[f"{name}_kernel"] = jnp.zeros_like(part[f"{name}_kernel"])
             part[f"{name}_bias"] = 10.0 * group + jnp.arange(part[f"{name}_bias"].shape[0])
-    grid = pillar_grid(config.pillars, SENSOR)  # type: ignore[arg-type]
-    cloud = make_frame(0, SENSOR).points
-    pillars = make_pillars(cloud, np.ones(len(cloud), bool), grid=grid, sensor=SENSOR)
-    outputs, _ = jax.jit(detector.apply)(variables, jax.tree.map(lambda leaf: leaf[None], pillars))
+    shapes = jax.eval_shape(detector.prepare, np.zeros((9, 5), np.float32), np.zeros(9, bool))
+    pillars = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), shapes)
+    outputs, _ = jax.jit(detector.apply)(variables, pillars)
     seen = {g: [k for k in range(10) if groups[k] == g] for g in range(3)}
     expected = [10.0 * groups[k] + seen[groups[k]].index(k) for k in range(10)]
     np.testing.assert_allclose(outputs.heat[0, 3, 4], expected)

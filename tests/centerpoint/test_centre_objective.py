@@ -23,6 +23,15 @@ GROUPED = dataclasses.replace(CONFIG, pillars=dataclasses.replace(PILLARS, group
 GRID = pillar_grid(PILLARS, SENSOR, stride=PILLARS.output_stride)
 
 
+OPTIONS = {"num_classes": 10, "min_overlap": PILLARS.min_overlap, "min_radius": PILLARS.min_radius}
+targets_of = jax.jit(functools.partial(centre_targets, grid=GRID, **OPTIONS))
+
+
+@functools.cache
+def losses_of(config):
+    return jax.jit(functools.partial(sample_losses, config=config, pillars=config.pillars, grid=GRID))
+
+
 @functools.cache
 def prepared(config):
     detector = build_detector(config, SENSOR)
@@ -46,10 +55,8 @@ def test_sums_equal_a_loop_over_boxes(config):
     boxes, labels, valid = ground_truth()
     boxes = boxes.at[::2, 7:].set(jnp.nan)
     predicted = outputs(config)
-    losses_of = jax.jit(functools.partial(sample_losses, config=config, pillars=config.pillars, grid=GRID))
-    parts, counts = losses_of(predicted, boxes, labels, valid)
-    options = {"num_classes": 10, "min_overlap": PILLARS.min_overlap, "min_radius": PILLARS.min_radius}
-    targets = centre_targets(boxes, labels, valid, grid=GRID, **options)
+    parts, counts = losses_of(config)(predicted, boxes, labels, valid)
+    targets = targets_of(boxes, labels, valid)
     away, at = focal_loss(predicted.heat, targets.heat, targets.cell, labels, targets.valid)
     numbers = np.asarray(encode_centres(targets.boxes, targets.cell, GRID))
     groups = config.class_groups
@@ -76,12 +83,11 @@ def test_every_group_is_divided_by_its_own_boxes():
     metrics = batch_metrics(of_batch, GROUPED.loss)
     pillars = jax.vmap(detector.prepare)(batch.points, batch.valid)
     found, _ = jax.jit(functools.partial(detector.apply, train=True))(variables, pillars)
-    losses_of = jax.jit(functools.partial(sample_losses, config=GROUPED, pillars=GROUPED.pillars, grid=GRID))
     sums, boxes = {"classification": np.zeros(6), "l1": np.zeros(6)}, np.zeros(6)
     for i in range(2):
         truth = (jnp.asarray(leaf[i]) for leaf in (batch.boxes, batch.labels, batch.box_valid))
         sample = jax.tree.map(lambda leaf, i=i: leaf[i], found)
-        own, count = losses_of(sample, *truth)
+        own, count = losses_of(GROUPED)(sample, *truth)
         sums, boxes = {name: sums[name] + own[name] for name in sums}, boxes + count["positives"]
     assert np.count_nonzero(boxes) > 2
     expected = {name: float((part / np.maximum(boxes, 1)).sum()) for name, part in sums.items()}
@@ -116,8 +122,7 @@ def test_a_batch_without_points_or_boxes_has_finite_losses_and_gradients():
 
 def test_an_exact_prediction_costs_nothing_but_confidence_and_overlaps_fully():
     boxes, labels, valid = ground_truth()
-    options = {"num_classes": 10, "min_overlap": PILLARS.min_overlap, "min_radius": PILLARS.min_radius}
-    targets = centre_targets(boxes, labels, valid, grid=GRID, **options)
+    targets = targets_of(boxes, labels, valid)
     numbers = encode_centres(targets.boxes, targets.cell, GRID)
     known = np.asarray(targets.valid)
     cell, first = np.unique(np.asarray(targets.cell)[known], return_index=True)
@@ -130,7 +135,7 @@ def test_an_exact_prediction_costs_nothing_but_confidence_and_overlaps_fully():
     exact = CentreOutputs(
         jnp.array(heat).reshape(side, side, 10), jnp.array(regression).reshape(side, side, 1, 10)
     )
-    parts, counts = sample_losses(exact, boxes, labels, alone, config=CONFIG, pillars=CONFIG.pillars, grid=GRID)
+    parts, counts = losses_of(CONFIG)(exact, boxes, labels, alone)
     assert float(parts["classification"].sum()) < 1e-4
     assert float(parts["l1"].sum()) < 1e-3
     assert float(counts["iou_sum"]) == pytest.approx(len(chosen), rel=1e-3)

@@ -1,5 +1,7 @@
 """Targets, focal loss and coding of centres against loops and closed forms."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,9 @@ from fcos_lidar_jax.iou import oriented
 
 GRID = Grid(24, 0.8, (-9.6, -9.6))
 OPTIONS = {"grid": GRID, "num_classes": 3, "min_overlap": 0.1, "min_radius": 2}
+
+
+targets_of = jax.jit(functools.partial(centre_targets, **OPTIONS))
 
 
 def ground_truth(seed=0, number=14):
@@ -73,21 +78,21 @@ def test_radius_is_the_published_one(size, overlap):
 def test_heat_is_that_of_loops_also_jitted_and_in_batches(seed):
     truth = ground_truth(seed)
     expected = heat_by_loops(*truth)
-    targets = jax.jit(lambda *t: centre_targets(*t, **OPTIONS))(*truth)
+    targets = targets_of(*truth)
     np.testing.assert_allclose(targets.heat, expected, atol=1e-6)
     assert targets.valid.sum() == np.count_nonzero(truth[2] & (np.abs(truth[0][:, :2]) < 9.6).all(axis=1)) > 3
     assert np.isfinite(targets.boxes).all()
     centres = targets.heat.reshape(-1, 3)[targets.cell[targets.valid], truth[1][targets.valid]]
     assert (centres == 1).all()
     other = ground_truth(7)
-    several = jax.vmap(lambda *t: centre_targets(*t, **OPTIONS))(*map(jnp.stack, zip(truth, other, strict=True)))
+    several = jax.vmap(targets_of)(*map(jnp.stack, zip(truth, other, strict=True)))
     np.testing.assert_array_equal(several.heat[0], targets.heat)
     np.testing.assert_allclose(several.heat[1], heat_by_loops(*other), atol=1e-6)
 
 
 def test_focal_loss_is_that_of_loops_and_finite_for_absurd_logits():
     boxes, labels, valid = ground_truth()
-    targets = centre_targets(boxes, labels, valid, **OPTIONS)
+    targets = targets_of(boxes, labels, valid)
     logits = np.random.default_rng(2).normal(0, 2, targets.heat.shape)
     p, heat = 1 / (1 + np.exp(-logits)), np.asarray(targets.heat, np.float64)
     away, at_boxes = focal_loss(jnp.float32(logits), targets.heat, targets.cell, labels, targets.valid)
@@ -107,7 +112,7 @@ def test_focal_loss_is_that_of_loops_and_finite_for_absurd_logits():
         parts = focal_loss(scale * jnp.float32(logits), targets.heat, targets.cell, labels, targets.valid)
         return sum(part.sum() for part in parts)
 
-    value, slope = jax.value_and_grad(total)(jnp.float32(1e4))
+    value, slope = jax.jit(jax.value_and_grad(total))(jnp.float32(1e4))
     assert np.isfinite(value)
     assert np.isfinite(slope)
 

@@ -118,12 +118,6 @@ def test_an_interruption_of_the_replacement_keeps_the_old_checkpoint(copy, monke
     assert contents(copy) == before
 
 
-def test_a_run_resumes_from_the_newest_checkpoint(copy):
-    checkpoint, state = copy.newest(state_at(0))
-    assert (checkpoint.step, checkpoint.score) == (6, 0.1)
-    assert bits(state) == bits(state_at(6))
-
-
 def test_corrupt_checkpoints_are_skipped_with_a_warning(copy, capsys):
     truncate(copy.folder / "00000006")
     (copy.folder / "00000004" / "checkpoint.json").write_text("{")
@@ -192,19 +186,6 @@ def test_leftovers_of_killed_saves_are_ignored_and_removed_by_the_next_save(copy
     save(copy, 8)
     assert list(copy.folder.glob(".*")) == []
     assert steps(copy) == [2, 4, 6, 8]
-
-
-def test_a_failed_save_changes_nothing(copy, monkeypatch):
-    before = contents(copy)
-
-    def full(*_, **__):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(storage, "_save_arrays", full)
-    with pytest.raises(OSError, match="No space left"):
-        save(copy, 8)
-    assert contents(copy) == before
-    assert list(copy.folder.glob(".*")) == []
 
 
 def test_a_run_stands_for_its_last_or_best_checkpoint(copy):

@@ -134,8 +134,9 @@ def flip(file: Path) -> None:
     file.write_bytes(content)
 
 
-@pytest.mark.parametrize("part", ["variables", "state"])
-@pytest.mark.parametrize("damage", [truncate, flip, Path.unlink])
+@pytest.mark.parametrize(
+    ("part", "damage"), [("variables", truncate), ("state", flip), ("variables", Path.unlink)]
+)
 def test_a_corrupt_array_file_is_named(copy, state, part, damage):
     largest = max((p for p in (copy / part).rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
     damage(largest)

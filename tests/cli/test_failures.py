@@ -40,7 +40,6 @@ def fail_with(error):
         (RecursionError("maximum recursion depth"), "nested too deeply: expected a file or an option with fewer"),
         (MemoryError(), "out of memory: for training, --optimizer.accumulate"),
         (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: for training, --optimizer.accumulate"),
-        (RuntimeError("Unable to initialize backend 'x': no"), "expected a platform of this machine: Unable to"),
         (
             RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
             "another process ended, see its output: UNK",
@@ -77,15 +76,56 @@ def test_a_bug_is_one_line_that_names_its_report(capsys, tmp_path, monkeypatch):
     assert f"jax {__import__('jax').__version__}" in text
 
 
+PLATFORM = "expected a platform of this machine, or, for NVIDIA GPUs, pip install -U"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error", "message"),
+    [
+        ("JAX_PLATFORMS", "cuda", AssertionError(), f"JAX_PLATFORMS: got 'cuda', {PLATFORM}"),
+        (
+            "JAX_PLATFORMS",
+            "x",
+            RuntimeError("Unable to initialize backend 'x'"),
+            f"JAX_PLATFORMS: got 'x', {PLATFORM}",
+        ),
+        (
+            *("JAX_PLATFORM_NAME", "gpu", RuntimeError("Unknown backend: 'gpu' requested")),
+            f"JAX_PLATFORM_NAME: got 'gpu', {PLATFORM}",
+        ),
+        (
+            *("JAX_TRANSFER_GUARD", "disallow", RuntimeError("Disallowed host-to-device transfer")),
+            "the environment has JAX_TRANSFER_GUARD=disallow, which makes JAX refuse more than usual: Disallowed",
+        ),
+        ("JAX_NO_EXECUTION", "1", RuntimeError("no_execution"), "the environment has JAX_NO_EXECUTION=1, which"),
+        ("JAX_DEBUG_NANS", "1", FloatingPointError("nan in jit"), "the environment has JAX_DEBUG_NANS=1, which"),
+        ("JAX_CHECK_TRACER_LEAKS", "1", Exception("leak"), "the environment has JAX_CHECK_TRACER_LEAKS=1, which"),
+        ("JAX_DEBUG_NANS", "1", ValueError("a.npy: no such file"), "a.npy: no such file"),
+    ],
+)
+def test_what_the_environment_of_jax_breaks_is_no_bug(capsys, monkeypatch, name, value, error, message):
+    monkeypatch.setenv(name, value)
+    monkeypatch.delenv("JAX_PLATFORMS" if name != "JAX_PLATFORMS" else "JAX_PLATFORM_NAME", raising=False)
+    monkeypatch.setattr("jax.devices", fail_with(AssertionError()))
+    assert exit_code("program", fail_with(error)) == 1
+    assert capsys.readouterr().err.startswith(f"program: error: {message}")
+
+
 @pytest.mark.slow
-def test_an_unknown_platform_is_one_line(tmp_path):
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ({"JAX_PLATFORMS": "abacus"}, f"JAX_PLATFORMS: got 'abacus', {PLATFORM}"),
+        ({"JAX_PLATFORMS": "cuda", "CUDA_VISIBLE_DEVICES": ""}, f"JAX_PLATFORMS: got 'cuda', {PLATFORM}"),
+        ({"JAX_TRANSFER_GUARD": "disallow"}, "the environment has JAX_TRANSFER_GUARD=disallow, which makes JAX"),
+    ],
+)
+def test_an_unusable_environment_is_one_line(tmp_path, environment, message):
     np.save(tmp_path / "a.npy", np.ones((9, 4)))
     words = ["project", tmp_path / "a.npy", "--out", tmp_path / "a.npz"]
-    done = run_python("-m", "fcos_lidar_jax", *words, JAX_PLATFORMS="abacus")
+    done = run_python("-m", "fcos_lidar_jax", *words, **environment)
     assert done.returncode == 1
-    assert done.stderr.startswith(
-        "fcos-lidar: error: JAX_PLATFORMS: got 'abacus', expected a platform of this mach"
-    )
+    assert done.stderr.startswith(f"fcos-lidar: error: {message}")
     assert done.stderr.count("\n") == 1
 
 

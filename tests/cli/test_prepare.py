@@ -159,7 +159,27 @@ def test_a_wrong_split_is_refused_before_the_index_is_made(root, tmp_path, capsy
     if splits is not None:
         (copy / VERSION / "splits.json").write_text(json.dumps(splits))
     assert_one_line_error(capsys, prepare(copy, tmp_path / "i", *more.split()), expected)
-    assert [file.name for file in (tmp_path / "i").iterdir()] == [".lock"]
+    assert not (tmp_path / "i").exists()
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_the_folder_is_told_before_it_is_written_and_asked_for_otherwise(
+    root, tmp_path, monkeypatch, capsys, given
+):
+    copy = shutil.copytree(root, tmp_path / "copy")
+    index = tmp_path / "i" if given else copy / ".fcos_lidar" / VERSION
+    line = prepare(copy, index)
+    line = line if given else [word for word in line if word not in ("--index", str(index))]
+    with monkeypatch.context() as patch:  # root may write anywhere
+        patch.setattr(os, "access", lambda *_: False)
+        found = (
+            f"--index: {index.parents[not given]}: found a folder without write permission, expected a folder to"
+        )
+        assert_one_line_error(capsys, line, f"{found} write to; name one by --index, here and for train$")
+    monkeypatch.setattr("fcos_lidar_jax.cli.prepare.build_index", lambda *_: pytest.fail(capsys.readouterr().err))
+    told = f"writing to {index}" + ("$" if given else "; --index names another folder")
+    with pytest.raises(pytest.fail.Exception, match=told):
+        command(*line)
 
 
 def test_a_version_without_annotations_only_gets_an_index(root, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """ROS recordings: point layouts of drivers, poses against closed forms, one-line errors."""
 
+import re
 import sys
 
 import numpy as np
@@ -71,6 +72,50 @@ def test_rows_of_organised_clouds_may_be_padded_and_contain_nan(tmp_path):
     [sweep] = ros_bag_drive(bag, TINY).sweeps
     np.testing.assert_array_equal(sweep.points[:, 2], rows["z"].ravel())
     np.testing.assert_array_equal(sweep.points[:, 0], rows["x"].ravel())
+
+
+@pytest.mark.parametrize("row_step", [0, 6, 6 * 16 - 1, 6 * 16 + 10, 2**32 - 1])
+def test_a_wrong_row_step_does_not_matter_where_the_length_decides(tmp_path, row_step):
+    rows = np.stack([POINTS[:6], POINTS[6:]])
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, rows, row_step=row_step))])
+    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    np.testing.assert_array_equal(sweep.points[:, 2], rows["z"].ravel())
+
+
+@pytest.mark.parametrize("form", ["sqlite", "mcap"])
+@pytest.mark.parametrize("identifier", ["  storage_identifier: ''\n", '  storage_identifier: ""\n', ""])
+def test_reindexed_recordings_without_a_storage_identifier_are_read(tmp_path, form, identifier):
+    bag = write_recording(tmp_path / "a", form, one_cloud)
+    text = (bag / "metadata.yaml").read_text()
+    changed = re.sub(r"  storage_identifier: .*\n", identifier, text)
+    assert changed != text
+    (bag / "metadata.yaml").write_text(changed)
+    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    np.testing.assert_array_equal(sweep.points[:, 2], POINTS["z"])
+
+
+@pytest.mark.parametrize("form", ["ros1", "sqlite", "mcap"])
+def test_folders_of_files_are_read_in_the_order_of_recording(tmp_path, form):
+    """The second file has the first name, as 10 comes before 9."""
+    folder = tmp_path / "files"
+    folder.mkdir()
+    for name, before in (("a_9", 0), ("a_10", 3)):
+        bag = write_recording(
+            tmp_path / name,
+            form,
+            lambda make, before=before: [
+                *[("/chatter", make.text("hello"))] * before,
+                *(("/p", make.cloud((before + i) * 1000, POINTS)) for i in range(3)),
+            ],
+        )
+        file = bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
+        file.rename(folder / f"{name}{file.suffix}")
+    assert is_ros_bag(folder)
+    sweeps = list(ros_bag_drive(folder, TINY).sweeps)
+    assert [sweep.time_us for sweep in sweeps] == [*range(6)]
+    assert [sweep.name for sweep in sweeps] == [f"{folder}: /p: message {i}" for i in range(6)]
+    (folder / "000.pcd").touch()
+    assert not is_ros_bag(folder)
 
 
 @pytest.mark.parametrize("form", FORMS)

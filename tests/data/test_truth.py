@@ -14,7 +14,6 @@ from made_kitti import make_kitti
 from made_nuscenes import make_tables, write
 from toy_frames import toy_frame
 
-from experiments import cached
 from experiments.cached import CachedFrames
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.class_mapping import MappedFrames
@@ -137,12 +136,3 @@ def test_the_truth_of_a_folder_reads_the_current_sweep_only(tmp_path):
     with pytest.raises(ValueError, match="older/001"):
         frames.frame(1)
     assert_truth(frames.truth(1), expected)
-
-
-def test_the_truth_of_a_cached_frame_does_not_unpack_the_points(tmp_path, monkeypatch):
-    frames, read = cached_frames(tmp_path / "data"), []
-    parse = cached.parse_npz
-    monkeypatch.setattr(cached, "parse_npz", lambda data, names: read.extend(names) or parse(data, names))
-    assert_truth(frames.truth(0), frames.frames.frame(0))
-    np.testing.assert_array_equal(frames.labels(0), frames.frames.labels(0))
-    assert set(read) == {"boxes", "labels", "num_points"}

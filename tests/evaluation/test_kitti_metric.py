@@ -170,6 +170,44 @@ def test_the_last_true_positive_is_a_threshold_anyhow(tmp_path):
         assert ap(tmp_path, street(number=80), found) == all_of(percent)
 
 
+FLAT = "Car -1 -1 -10 100 100 150 150 -1 -1 -1 -1000 -1000 -1000 -10 0.9\n"
+"""A detection in the image only."""
+
+ODD_RESULTS = {  # what changes in fifty perfect detections: the moderate AP of cars, and what is told
+    "case": (lambda rows: [row.replace("Car", "cAR") for row in rows], 100.0, ""),
+    "unknown types": (
+        lambda rows: [*rows, line("Person", -9.0, score=0.9), *[line("Bicycle", 1.0, score=0.9)] * 2],
+        *(100.0, "skipped, none of KITTI's types: 2 Bicycle, 1 Person"),
+    ),
+    "a low unknown type": (  # taken by an object, as any low detection
+        lambda rows: [line("Person", score=0.9, high=20.0), *rows],
+        *(97.5, "skipped, none of KITTI's types: 1 Person"),
+    ),
+    "image only": (lambda rows: [*rows, FLAT], 100 * 50 / 51, "without a box in 3D, and therefore false: 1 det"),
+    "image only, of no type": (
+        lambda rows: [*rows, FLAT.replace("Car", "Bicycle"), FLAT.replace("Car", "DontCare")],
+        *(100.0, "skipped, none of KITTI's types: 1 Bicycle"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", ODD_RESULTS)
+def test_results_are_read_as_by_the_development_kit(tmp_path, case):
+    """From the folder data, beside which the development kit writes other text files."""
+    change, percent, told = ODD_RESULTS[case]
+    label, result = "".join(street()), "".join(change(street(score=0.8)))
+    files = {"labels/000000": label, "results/data/000000": result, "results/stats_car_detection": "0 0"}
+    for name, text in files.items():
+        (file := tmp_path / f"{name}.txt").parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    summary = evaluate_kitti(tmp_path / "results", tmp_path / "labels")
+    assert summary["classes"]["Car"]["3d"]["moderate"] == pytest.approx(percent)
+    expected = score([(label, result)])
+    assert expected["car", "3d", "moderate"][1] == pytest.approx(percent)
+    lines = describe_kitti(summary).splitlines()[7:]
+    assert [text.startswith(told) for text in lines] == [True] * bool(told)
+
+
 def test_bad_results_get_one_line(tmp_path):
     labels = tmp_path / "labels"
     with refused("classes: got 'Vans', expected"):
@@ -178,7 +216,7 @@ def test_bad_results_get_one_line(tmp_path):
         evaluate_kitti(tmp_path / "none", labels)
     for result, message in (
         (line(score=0.5) + line(), "000000.txt: line 2: got 15 values, expected 16, the score last"),
-        (line(score=0.5).replace("Car", "car"), "line 1: type: got 'car', expected Car"),
+        (FLAT, "results: got boxes in the image only, expected height to rotation_y"),
         (line(score=0.5).replace("0.5", "nan"), "line 1: score: got 'nan', expected a finite number"),
     ):
         with refused(message):

@@ -201,7 +201,10 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "KITTI AP_R40 on 6 frames" in printed
     assert "mAP by centre distance" in printed
-    # The result files alone give the same numbers.
+    # The result files alone give the same numbers, from the folder that the development kit reads, too.
+    (tmp_path / "out" / "results_kitti").rename(tmp_path / "data")
+    (tmp_path / "out" / "results_kitti").mkdir()
+    (tmp_path / "data").rename(tmp_path / "out" / "results_kitti" / "data")
     command(f"evaluate --data-root {root} --results {tmp_path}/out/results_kitti --out {tmp_path}/again")
     again = json.loads((tmp_path / "again" / "metrics_kitti.json").read_text())
     assert {**again, "left_out": metrics["left_out"]} == metrics

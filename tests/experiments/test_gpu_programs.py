@@ -56,7 +56,7 @@ def test_kernels_are_counted_by_loop_and_of_branches_the_larger():
     assert loops == [(5, 2), (None, 1)]
 
 
-@pytest.mark.parametrize("name", ["train-compact", "train-nuscenes-8-devices", "detect-nuscenes", "train-kitti"])
+@pytest.mark.parametrize("name", ["train-nuscenes-8-devices", "detect-nuscenes"])
 def test_programs_match_the_package(name):
     """Shapes of the arguments, which of them are split over the devices, and what is given away."""
     program = PROGRAMS[name]

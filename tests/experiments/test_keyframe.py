@@ -47,14 +47,6 @@ def test_a_keyframe_has_points_boxes_and_unknown_velocities(tmp_path):
 
 
 @pytest.mark.real_data
-def test_a_real_keyframe_has_its_boxes(real_data):
-    frame = read_keyframe(real_data / "nuscenes_scene0061", NUSCENES_HDL32E)
-    assert frame.boxes.shape == (68, 9)
-    assert np.isnan(frame.boxes[:, 7]).sum() == 2
-    assert (frame.num_points == 0).sum() == 3
-
-
-@pytest.mark.real_data
 def test_real_keyframes_of_a_list_have_their_boxes_and_points(real_data):
     """The annotated counts are of boxes with their full rotation, so that a few differ."""
     counts = []

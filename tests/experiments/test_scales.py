@@ -1,10 +1,7 @@
 """What the cells of each scale are trained and evaluated on."""
 
 import dataclasses
-import multiprocessing
 import re
-import shutil
-import time
 
 import numpy as np
 import pytest
@@ -129,30 +126,3 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
         testing.checked()
     splits.write_text(splits.read_text().replace("}", ', "test": ["scene-0002"]}'))
     assert testing.checked().test_version == "v1.0-mini"
-    # Another version has its own splits.
-    tables = shutil.copytree(tmp_path / "one" / "v1.0-mini", tmp_path / "one" / "v1.0-test")
-    (tables / "splits.json").write_text('{"test": ["scene-0001"]}')
-    other = dataclasses.replace(testing, version="v1.0-mini", test_version="v1.0-test").checked()
-    frames = other.frames("test", other.base, other.test_version)
-    assert {frames.scene(i) for i in range(len(frames))} == {"scene-0001"}
-    shutil.rmtree(tables)
-    for cloud in (tmp_path / "one" / "samples" / "LIDAR_TOP").iterdir():
-        cloud.unlink()
-    NuScenesLayout._data.cache_clear()
-    with pytest.raises(ValueError, match=r"^--test-version: .*\.pcd\.bin: no such file"):
-        testing.checked()
-
-
-def test_other_processes_simulate_the_frames_of_a_scale(tmp_path):
-    scale = dataclasses.replace(smoke(tmp_path), train_frames=2, test_frames=1)
-    folders = {split: scale.frames(split, 10).frames for split in ("train", "test")}
-    with scale.simulating(0):
-        assert not multiprocessing.active_children()
-    end = time.monotonic() + 120
-    with scale.simulating(1):
-        while [len(cached.made()) for cached in folders.values()] != [2, 1]:
-            assert time.monotonic() < end
-            time.sleep(0.1)
-    assert not multiprocessing.active_children()
-    again = dataclasses.replace(scale, cache=tmp_path / "again").frames("train", 10).frame(1)
-    np.testing.assert_array_equal(folders["train"].frame(1).points, again.points)

@@ -1,1 +1,1 @@
-"""Seeded fuzzing of all file readers: ``python -m tests.fuzz``."""
+"""Fuzzing of all file readers."""

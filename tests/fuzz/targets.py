@@ -1,11 +1,9 @@
 """The targets: valid files, and the reader of each with checks of its result."""
 
-import contextlib
 import dataclasses
 import functools
 import io
 import json
-import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,8 +19,6 @@ from made_nuscenes import VERSION, make_tables
 from made_nuscenes import write as write_nuscenes
 from toy_frames import ToyFrames
 
-from experiments.cached import CachedFrames
-from experiments.keyframe import read_keyframe
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import read_class_map
@@ -76,10 +72,10 @@ SPEC = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=F
 
 NAMES = (
     *("raw points", "raw points of KITTI", "npy", "npz", "pcd", "feather", "Argoverse 2", "KITTI"),
-    *("folder", "nuScenes", "nuScenes index", "list of sweeps", "keyframe", "sensor", "poses"),
+    *("folder", "nuScenes", "nuScenes index", "list of sweeps", "sensor", "poses"),
     *("recordings of ROS", "class map", "results", "ground truth", "detections", "run.json"),
     *("metrics.jsonl", "resume log", "checkpoint.json", "exported detector", "ground-truth database"),
-    *("cached frames", "records of synthesize"),
+    "records of synthesize",
 )
 """Of all targets, in the order of :func:`make_targets`."""
 
@@ -419,7 +415,6 @@ def _seal_description(folder: Path, name: str) -> None:
 
 
 FRAMES = ToyFrames(1)
-FRAME = FRAMES.frame(0)
 
 
 def _read_database(folder: Path, name: str) -> None:
@@ -429,14 +424,6 @@ def _read_database(folder: Path, name: str) -> None:
         expect(points.shape == (database.table["count"][i], database.manifest.columns), "points of another shape")
     labels = database.table["label"]
     expect(((labels >= 0) & (labels < len(database.manifest.classes))).all(), "a label that is no class")
-
-
-def _read_cached(folder: Path, name: str) -> None:
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
-        found = CachedFrames(FRAMES, folder).frame(0)
-    expect(
-        all(np.array_equal(getattr(found, f), v, equal_nan=True) for f, v in vars(FRAME).items()), "another frame"
-    )
 
 
 def _synthesize(folder: Path, name: str = "") -> None:
@@ -473,10 +460,6 @@ def make_targets() -> list[Target]:
     index = _files(_index_files)
     synthesized = _files(_synthesize)
     listed = [{"file": f"{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("a", 5))]
-    boxes = [
-        {"class": "car", **dict(zip(("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy"), range(1, 10), strict=True))}
-    ]
-    boxes = [{**box, "num_lidar_pts": 3} for box in (*boxes, {**boxes[0], "vx": None, "vy": None})]
     found = {"a": [], "b": [{**_box(), "sample_token": "b", "detection_score": 0.5}] * 2}
     truth = {t: {"ego_translation": [0.0, 0, 0], "boxes": [_box(num_pts=3)] * 2} for t in "ab"}
     truth["b"]["boxes"] = [_box(detection_name="static_object.bicycle_rack", attribute_name="", num_pts=-1)]
@@ -505,11 +488,6 @@ def make_targets() -> list[Target]:
         Target("nuScenes", tables, _read_nuscenes),
         Target("nuScenes index", index, _read_index, tuple(is_column)),
         Target("list of sweeps", {"a.json": _json(listed), "a.npy": arrays["a.npy"]}, _read_sweeps, ("a.json",)),
-        Target(
-            "keyframe",
-            {"boxes.json": _json({"lidar_file": "a.npy", "boxes": boxes}), "a.npy": arrays["a.npy"]},
-            lambda folder, _: check_boxes(read_keyframe(folder, NUSCENES_HDL32E).boxes, "box {}".format),
-        ),
         file_target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor),
         file_target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),
         Target("recordings of ROS", _files(_recordings), _read_recording),
@@ -542,11 +520,5 @@ def make_targets() -> list[Target]:
             seal=_seal_exported,
         ),
         Target("ground-truth database", _files(lambda folder: prepare_database(FRAMES, folder)), _read_database),
-        Target(
-            "cached frames",
-            _files(lambda folder: CachedFrames(FRAMES, folder).frame(0)),
-            _read_cached,
-            mutate=lambda _, content, rng: mutate_bytes(content, rng),
-        ),
         Target("records of synthesize", synthesized, _synthesize, records),
     ]

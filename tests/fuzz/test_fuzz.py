@@ -21,7 +21,7 @@ from fcos_lidar_jax.input_pipeline.open import Format
 
 from .targets import NAMES, InvalidError, Target, make_targets, plain_name
 
-EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "100"))
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
 MEMORY_MIB, SECONDS = 512, 10  # that one input may take
 LONGEST_MESSAGE = 20_000  # characters, not counting the file's name: room for a few of the longest values
 

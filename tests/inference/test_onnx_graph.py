@@ -51,12 +51,12 @@ CASES = {
     ),
     "a sector, padded with empty columns": (CONFIG, sector(SENSOR, np.pi / 2, 40)),
     "a turn that pads itself twice": (CONFIG, dataclasses.replace(SENSOR, num_columns=12)),
-    "local geometry, two rounds, padded columns": (
+    "local geometry, two rounds, a tenth channel, padded columns": (
         with_model(
             with_stem(),
             local_geometry=True,
-            channel_mean=(1, 2, -1, 12, 0.3, -0.2, 20, 0, 0.1),
-            channel_scale=(12.0, 11.5, 0.9, 8.0, 0.3, 0.2, 20.0, 2.0, 0.16),
+            channel_mean=(1, 2, -1, 12, 0.3, -0.2, 20, 0, 0.1, 3),
+            channel_scale=(12.0, 11.5, 0.9, 8.0, 0.3, 0.2, 20.0, 2.0, 0.16, 5.0),
         ),
         ODD,
     ),
@@ -94,7 +94,7 @@ def made_features(detector):
     """Features of two clouds, with a third of the cells empty."""
     rng, model = np.random.default_rng(1), detector.config.model
     layout, rounds = image_layout(detector.sensor, model), detector.config.projection.num_rounds
-    shape = 2, layout.rows, layout.columns, 9, rounds
+    shape = 2, layout.rows, layout.columns, len(model.channel_mean), rounds
     mean, scale = (np.array(values)[:, None] for values in (model.channel_mean, model.channel_scale))
     features = rng.normal(size=shape) * scale + mean
     features[..., 7, :] = rng.random(shape[:3] + shape[4:]) > 0.3

@@ -98,13 +98,6 @@ def test_a_dropped_object_does_not_exclude_others(tmp_path):
     assert {tuple(sorted(paste.boxes[:, 0])) for paste in pasted} == {(13,), (10, 16)}
 
 
-def test_classes_with_enough_objects_get_none(objects):
-    frame = toy_frame(100)
-    present = np.bincount(frame.labels[frame.num_points >= 1], minlength=10)
-    paste, removed = pasted_into(frame, objects, targets=tuple(present.tolist()))
-    assert (paste.points.shape, len(paste.boxes), len(removed)) == ((0, 5), 0, 0)
-
-
 def test_boxes_without_points_exclude_overlaps_but_do_not_count(objects):
     frame = toy_frame(100)
     paste, _ = pasted_into(dataclasses.replace(frame, num_points=np.zeros_like(frame.num_points)), objects)

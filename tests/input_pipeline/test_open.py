@@ -165,22 +165,6 @@ def test_intensities_are_brought_to_the_scale_of_the_network_by_a_given_factor(r
         open_frames(root, intensity_scale=8.0)
 
 
-def test_a_data_set_is_opened_once_unless_only_its_frames_know_the_scaled_sensor(roots, monkeypatch):
-    opened = []
-
-    def counted(reader):
-        return dataclasses.replace(
-            reader, open=lambda data, **how: opened.append(reader.name) or reader.open(data, **how)
-        )
-
-    monkeypatch.setattr("fcos_lidar_jax.input_pipeline.open.READERS", tuple(map(counted, READERS)))
-    for format in ("kitti", "argoverse2", "folder"):
-        open_frames(roots[format], intensity_scale=8.0)
-    scaled = open_frames(roots["folder"], intensity_scale=8.0, sensor=TINY)
-    assert opened == ["kitti", "argoverse2", "folder", "folder", "folder"]
-    assert scaled.sensor == dataclasses.replace(TINY, intensity_scale=8.0)
-
-
 def test_kitti_is_cropped_to_the_image_unless_the_full_turn_is_wanted(roots):
     cropped, whole = open_frames(roots["kitti"]), open_frames(roots["kitti"], full_turn=True)
     raw = np.fromfile(roots["kitti"] / "training" / "velodyne" / "000000.bin", np.float32).reshape(-1, 4)

@@ -1,6 +1,5 @@
 """Weight gradients on CPU are those of the library, however they are transformed, and absent elsewhere."""
 
-import dataclasses
 import functools
 import math
 
@@ -77,7 +76,7 @@ def test_values_and_gradients_are_the_librarys(case, dtype):
     assert_close([function(x, kernel), *found], [values, *expected], TOLERANCES[dtype])
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", ["3x3", "circular", "strided", "1x1"])
 def test_batches_of_gradients_and_gradients_of_batches(case):
     """Per-sample gradients add up to the batch's; so does the gradient of a mapped function, recomputed or not."""
     function, (x, kernel, weights), _, (to_x, to_kernel) = example(case)
@@ -176,10 +175,8 @@ def test_small_images_have_no_rows(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", TOLERANCES)
-def test_a_networks_losses_and_gradients_are_those_with_the_librarys(precision, monkeypatch):
-    model = dataclasses.replace(CONFIG.model, precision=precision)
-    detector = build_detector(dataclasses.replace(CONFIG, model=model), SENSOR)
+def test_a_networks_losses_and_gradients_are_those_with_the_librarys(monkeypatch):
+    detector = build_detector(CONFIG, SENSOR)
     given = weights()["params"], weights()["batch_stats"], host_batch()
     runs = []
     for large in (0, math.inf):
@@ -188,10 +185,10 @@ def test_a_networks_losses_and_gradients_are_those_with_the_librarys(precision, 
         runs.append(jax.device_get(jax.jit(lambda *given, gradient=gradient: gradient(*given))(*given)))
     (found, _, metrics), (expected, _, expected_metrics) = runs
     assert int(metrics["positives"]) > 0
-    assert_close(*(jax.tree.leaves(tree) for tree in (metrics, expected_metrics)), TOLERANCES[precision])
+    assert_close(*(jax.tree.leaves(tree) for tree in (metrics, expected_metrics)), 1e-5)
     largest = max(np.abs(leaf).max() for leaf in jax.tree.leaves(expected))
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCES[precision] * largest)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * largest)
 
 
 SHARDED = """

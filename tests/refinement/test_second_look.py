@@ -10,20 +10,20 @@ import pytest
 import tiny_peer
 import tiny_run
 from linear_network import linear_network
-from tiny_run import LOOK as SMALL
-from tiny_run import SENSOR, bits, host_batch, train_tiny, untrained
+from tiny_run import SENSOR, bits, host_batch, untrained
 
-from fcos_lidar_jax.checkpoints import load_checkpoint
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.refinement.network import SecondLook
-from fcos_lidar_jax.refinement.stage import best_boxes, over_samples, refinement_sums, trainable
-from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+from fcos_lidar_jax.refinement.stage import best_boxes, refinement_sums, trainable
+from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step, plan
 from fcos_lidar_jax.training.step import make_gradient
 
 pytestmark = pytest.mark.slow
 
+SMALL = dataclasses.replace(tiny_run.LOOK, first_score_weight=0.25)
 FROZEN = dataclasses.replace(SMALL, freeze_detector=True)
 CONFIGS = {"FCOS-LiDAR": tiny_run.CONFIG, "CenterPoint": tiny_peer.CONFIG}
 BOTH = pytest.mark.parametrize("name", CONFIGS)
@@ -43,26 +43,32 @@ def detector(name: str, refinement: RefinementConfig | None):
     return build_detector(config, SENSOR), jax.tree.map(jnp.asarray, untrained(config, SENSOR))
 
 
-def found(name: str, refinement: RefinementConfig | None, variables=None, cloud: int = 0):
-    model, weights = detector(name, refinement)
-    batch = host_batch()
-    program = jax.jit(make_detect(model))
-    return jax.device_get(program(variables or weights, batch.points[cloud], batch.valid[cloud]))
+@functools.cache
+def detect(name: str, refinement: RefinementConfig | None):
+    return jax.jit(make_detect(detector(name, refinement)[0]))
 
 
-@pytest.mark.parametrize(
-    ("name", "weight"), [("FCOS-LiDAR", 0.25), ("CenterPoint", 0.25), ("FCOS-LiDAR", 0.0), ("FCOS-LiDAR", 1.0)]
-)
-def test_boxes_are_the_detectors_best_with_the_mean_of_both_scores(name, weight):
+@functools.cache
+def gradient(name: str, refinement: RefinementConfig | None):
+    return jax.jit(make_gradient(detector(name, refinement)[0]))
+
+
+def found(name: str, refinement: RefinementConfig | None, variables=None):
+    batch, variables = host_batch(), variables or detector(name, refinement)[1]
+    return jax.device_get(detect(name, refinement)(variables, batch.points[0], batch.valid[0]))
+
+
+@BOTH
+def test_boxes_are_the_detectors_best_with_the_mean_of_both_scores(name):
     """With zero weights all classes are equally probable and no box moves."""
-    small = dataclasses.replace(SMALL, first_score_weight=weight)
-    _, variables = detector(name, small)
+    _, variables = detector(name, SMALL)
     zero = jax.tree.map(jnp.zeros_like, variables["params"]["refinement"])
-    after = found(name, small, variables | {"params": variables["params"] | {"refinement": zero}})
+    after = found(name, SMALL, variables | {"params": variables["params"] | {"refinement": zero}})
     before = found(name, None)
     number = int(before.valid.sum())
     assert number > 8
     assert after.valid.sum() == 8
+    weight = SMALL.first_score_weight
     expected = np.exp(weight * np.log(before.scores[:8]) + (1 - weight) * np.log(1 / 11))
     np.testing.assert_allclose(after.scores[:8], expected, rtol=1e-5)
     np.testing.assert_allclose(after.boxes[:8], before.boxes[:8], rtol=1e-4, atol=1e-4)
@@ -79,28 +85,25 @@ def test_moved_boxes_are_sorted_by_different_scores():
     assert len(np.unique(after.scores[:number])) > 1
 
 
-@BOTH
-def test_the_detectors_own_losses_and_gradients_stay(name):
-    model, variables = detector(name, None)
-    refined, both = detector(name, SMALL)
+def test_the_detectors_own_losses_and_gradients_stay():
+    name = "FCOS-LiDAR"
+    _, variables = detector(name, None)
+    _, both = detector(name, SMALL)
     batch, own = host_batch(), variables["params"]
-    alone, _, metrics = jax.jit(make_gradient(model))(own, variables["batch_stats"], batch)
+    alone, _, metrics = gradient(name, None)(own, variables["batch_stats"], batch)
     params = own | {"refinement": both["params"]["refinement"]}
-    joint, _, with_look = jax.jit(make_gradient(refined))(params, variables["batch_stats"], batch)
-    for name_of, gradient in alone.items():
-        for a, b in zip(*map(jax.tree.leaves, (gradient, joint[name_of])), strict=True):
-            # Unoptimised programs round the two uses of a pillar's maximum differently, which cuts its gradient.
-            if name == "FCOS-LiDAR":
-                np.testing.assert_allclose(a, b, atol=1e-4 * max(1.0, float(jnp.abs(a).max())))
+    joint, _, with_look = gradient(name, SMALL)(params, variables["batch_stats"], batch)
+    for name_of, of_part in alone.items():
+        for a, b in zip(*map(jax.tree.leaves, (of_part, joint[name_of])), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-4 * max(1.0, float(jnp.abs(a).max())))
     assert float(with_look["loss/refined_class"]) > 0
     assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(joint["refinement"])) > 0
     for key in metrics.keys() - {"loss/total"}:
         np.testing.assert_allclose(with_look[key], metrics[key], rtol=1e-5)
 
 
-@BOTH
-def test_a_frozen_detector_is_not_changed(name):
-    model, variables = detector(name, FROZEN)
+def test_a_frozen_detector_is_not_changed():
+    model, variables = detector("FCOS-LiDAR", FROZEN)
     optimizer = make_optimizer(model.config.optimizer, 10)
     state = make_state(model, optimizer, jax.random.key(0), variables=variables)
     after, metrics = jax.jit(make_train_step(model, optimizer))(state, host_batch())
@@ -122,7 +125,7 @@ def test_a_frozen_detector_is_not_changed(name):
 
 def test_losses_equal_sums_over_the_samples():
     """Two samples are processed in a loop, one sample without it."""
-    model, variables = detector("FCOS-LiDAR", SMALL)
+    model, variables = detector("FCOS-LiDAR", SMALL)  # of whose network nothing is asked
     network, batch = SecondLook(10, SMALL.point_channels, SMALL.box_channels), host_batch()
     boxes = jnp.concatenate([batch.boxes[0, :4], batch.boxes[1, :3] + 0.3]), jnp.linspace(0.9, 0.1, 7)
     labels = jnp.concatenate([batch.labels[0, :4], batch.labels[1, :3]])
@@ -130,9 +133,8 @@ def test_losses_equal_sums_over_the_samples():
 
     @jax.jit
     def sums(batch):
-        inputs = jax.vmap(model.prepare)(batch.points, batch.valid)
-        outputs, _ = model.apply(variables, inputs)
-        return refinement_sums(model, network, variables, outputs, inputs, batch)
+        nothing = jnp.zeros((len(batch.points), 1))
+        return refinement_sums(model, network, variables, nothing, nothing, batch)
 
     whole = sums(batch)
     parts = [sums(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], batch)) for i in range(2)]
@@ -143,12 +145,13 @@ def test_losses_equal_sums_over_the_samples():
 
 
 def test_a_cloud_without_points_has_finite_gradients_and_no_boxes():
-    model, variables = detector("FCOS-LiDAR", SMALL)
+    case = "FCOS-LiDAR", SMALL
+    variables = detector(*case)[1]
     batch = dataclasses.replace(host_batch(), valid=np.zeros((2, 1024), bool))
-    gradient, _, metrics = jax.jit(make_gradient(model))(variables["params"], variables["batch_stats"], batch)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    gradients, _, metrics = gradient(*case)(variables["params"], variables["batch_stats"], batch)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
     assert float(metrics["refined_boxes"]) == 0
-    empty = jax.jit(make_detect(model))(variables, batch.points[0], batch.valid[0])
+    empty = detect(*case)(variables, batch.points[0], batch.valid[0])
     assert not empty.valid.any()
 
 
@@ -166,41 +169,22 @@ def test_points_of_boxes_decide_the_scores():
     assert float(jnp.abs(scores - others).max()) > 0.1 * float(scores.max())
 
 
-def test_both_ways_through_a_batch_agree():
-    samples = jnp.arange(6.0).reshape(3, 2), {"a": jnp.arange(3)}
-    double = jax.jit(lambda samples: over_samples(lambda s: (s[0] * 2, s[1]["a"]), samples))(samples)
-    np.testing.assert_array_equal(double[0], samples[0] * 2)
-    np.testing.assert_array_equal(double[1], samples[1]["a"])
-
-
 def test_best_boxes_are_padded():
     boxes = jnp.ones((2, 9)), jnp.array([0.9, 0.5]), jnp.array([0, 1]), jnp.ones(2, bool)
     assert best_boxes(boxes, 3)[3].tolist() == [True, True, False]
 
 
-@pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    """A run without a second look, of a network that compiles quickly."""
-    folder = tmp_path_factory.mktemp("first")
-    with linear_network():
-        train_tiny(folder)
-        yield folder
+def test_training_starts_from_weights_with_or_without_a_second_look(tmp_path, capsys):
+    def of_detector(variables):
+        return bits({name: part for name, part in variables["params"].items() if name != "refinement"})
 
-
-@pytest.mark.parametrize("refinement", [SMALL, FROZEN], ids=["joint", "frozen"])
-def test_training_starts_from_weights_without_a_second_look(first, tmp_path, refinement, capsys):
-    # So few steps predict nothing that is more probable.
-    inference = dataclasses.replace(tiny_run.CONFIG.inference, min_probability=0.0)
-    config = dataclasses.replace(tiny_run.CONFIG, refinement=refinement, inference=inference)
-    train_tiny(tmp_path / "second", config=config, weights=str(first))
-    assert "has no second look: it starts with random weights" in capsys.readouterr().err
-    before, after = load_checkpoint(first), load_checkpoint(tmp_path / "second")
-    assert after.config.refinement == refinement
-    detector_of = {k: v for k, v in after.variables["params"].items() if k != "refinement"}
-    assert (bits(before.variables["params"]) == bits(detector_of)) == refinement.freeze_detector
-
-
-def test_the_second_look_of_weights_is_left_out_without_one(first, tmp_path, capsys):
-    train_tiny(tmp_path / "second", config=tiny_run.REFINED, weights=str(first), steps=1)
-    train_tiny(tmp_path / "third", weights=str(tmp_path / "second"), steps=1)
-    assert "the second look is left out" in capsys.readouterr().err
+    for given, own, told in (
+        (None, SMALL, "has no second look: it starts with random weights"),
+        (SMALL, None, "the second look is left out"),
+    ):
+        model, variables = detector("FCOS-LiDAR", given)
+        save_checkpoint(tmp_path / "weights", Checkpoint(model.config, SENSOR, variables, 1))
+        initial = plan._initial_weights(detector("FCOS-LiDAR", own)[0], tmp_path / "weights")
+        assert told in capsys.readouterr().err
+        assert of_detector(initial) == of_detector(variables)
+        assert ("refinement" in initial["params"]) == (own is not None)

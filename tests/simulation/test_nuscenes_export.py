@@ -1,6 +1,5 @@
 """Check synthetic data sets: official layout, exact annotations, and identical bytes after interruptions."""
 
-import itertools
 import json
 import os
 import signal
@@ -16,9 +15,7 @@ from kills import killed_twice
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax import cli
-from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import WHOLE_SWEEP
-from fcos_lidar_jax.data.box_geometry import inside_box
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.sensors import TINY, sensor_to_json
 
@@ -68,13 +65,6 @@ def made(tmp_path_factory) -> Path:
     return synthesize(tmp_path_factory.mktemp("made") / "data")
 
 
-@pytest.fixture(scope="module")
-def street(tmp_path_factory) -> Path:
-    """A data set of two scenes with the full sensor, long enough for ten sweeps."""
-    order = ["--scenes", "2", "--keyframes", "4", "--sensor", "nuscenes_hdl32e", "--seed", "10"]
-    return synthesize(tmp_path_factory.mktemp("street") / "data", *order)
-
-
 def test_the_layout_is_official(made):
     found = tables(made)
     assert set(found) == {*KEYS, "splits"}
@@ -116,10 +106,9 @@ def test_tokens_and_chains_refer_to_existing_rows(made):
         assert chain[0]["num_lidar_pts"] > 0 < chain[-1]["num_lidar_pts"]
 
 
-@pytest.mark.slow
-def test_annotated_point_counts_are_exact(street):
+def test_annotated_point_counts_are_exact(made):
     """Counts points of a rolling shutter in the global frame with the quaternions of the files."""
-    found, data = tables(street), NuScenes(street, VERSION)
+    found, data = tables(made), NuScenes(made, VERSION)
     counted = 0
     for sample in data.sample_tokens:
         points = data.fuse_sweeps(sample, WHOLE_SWEEP)[0][:, :3].astype(np.float64)
@@ -130,62 +119,15 @@ def test_annotated_point_counts_are_exact(street):
             inside = (np.abs(local) <= np.array(row["size"])[[1, 0, 2]] / 2).all(axis=1)
             assert inside.sum() == row["num_lidar_pts"], row["token"]
             counted += 1
-    assert counted == len(found["sample_annotation"]) > 300
-    assert sum(row["num_lidar_pts"] for row in found["sample_annotation"]) > 10_000
-
-
-def test_attributes_follow_from_the_motions(street):
-    """All annotations are read. Velocities are central differences of the reader."""
-    data, found = NuScenes(street, VERSION), tables(street)
-    seen, kinds, speeds = set(), set(), []
-    for sample in data.sample_tokens:
-        boxes = data.boxes(sample)
-        seen |= set(boxes.tokens)
-        for box, label, attribute in zip(boxes.boxes, boxes.labels, boxes.attributes, strict=True):
-            assert (attribute == "") == (NUSCENES_CLASSES[label] in ("traffic_cone", "barrier"))
-            kinds.add(attribute)
-            speed = np.hypot(*box[7:9])
-            if np.isnan(speed):
-                continue
-            speeds.append(speed)
-            if attribute in ("vehicle.moving", "pedestrian.moving", "cycle.with_rider"):
-                assert speed > 0.05
-            elif attribute != "vehicle.stopped":  # stopped vehicles may have stopped only just now
-                assert speed < 0.01, attribute
-    assert seen == {row["token"] for row in found["sample_annotation"]}
-    assert max(speeds) > 3
-    assert len(kinds) >= 6
-    assert {row["visibility_token"] for row in found["sample_annotation"]} == {"1", "2", "3", "4"}
-
-
-def test_old_points_stay_in_boxes_of_static_objects(street):
-    """Compares points above the ground of the tenth and the first sweep; see test_world.py for moving objects."""
-    data = NuScenes(street, VERSION)
-    stands, unposed = [], []
-    for last, token in (pair for split in ("train", "val") for pair in itertools.pairwise(data.split(split))):
-        cloud = data.sweeps(token, 10)
-        np.testing.assert_allclose(np.unique(cloud[:, 4]), np.arange(10) * 0.05, atol=1e-6)
-        newest, oldest = (cloud[cloud[:, 4] == lag, :3] for lag in (0, cloud[:, 4].max()))
-        motion = np.linalg.inv(data.sensor_to_global(last)) @ data.sensor_to_global(token)
-        assert np.linalg.norm(motion[:3, 3]) > 1
-        wrong = oldest @ motion[:3, :3].T + motion[:3, 3]  # approximately undoes the reader's transformation
-        truth = data.boxes(token)
-        for box in truth.boxes[(truth.num_lidar_pts > 50) & (np.hypot(*truth.boxes[:, 7:9].T) < 0.01)]:
-            box = box + np.array([0, 0, 0.3, 0.2, 0.2, -0.6, 0, 0, 0])
-            now, then, unmoved = (inside_box(points, box).sum() for points in (newest, oldest, wrong))
-            if now > 20:
-                stands.append(then / now)
-                unposed.append(unmoved / now)
-    assert len(stands) >= 5
-    assert 0.7 < np.median(stands) < 1.4
-    assert np.median(unposed) < 0.7 * np.median(stands)
+    assert counted == len(found["sample_annotation"]) > 20
+    assert sum(row["num_lidar_pts"] for row in found["sample_annotation"]) > 300
 
 
 @pytest.mark.slow
 def test_bytes_depend_on_seed_and_shutter_but_not_on_workers_or_the_number_of_scenes(made, tmp_path):
     expected = contents(made)
     assert contents(synthesize(tmp_path / "again", "--workers", "2")) == expected
-    other = contents(synthesize(tmp_path / "other", "--seed", "5"))
+    other = contents(synthesize(tmp_path / "other", "--seed", "5", "--scenes", "1"))
     assert all(other[name] != expected[name] for name in expected if name in other and name.endswith(".bin"))
     assert tables(tmp_path / "other")["sample"] != tables(made)["sample"]
     alone = contents(synthesize(tmp_path / "one", "--scenes", "1"))
@@ -218,7 +160,7 @@ def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, 
 
 @pytest.mark.slow
 def test_killed_runs_resume_to_the_same_bytes(tmp_path):
-    quick = ["--streets", "plain", "--no-rolling-shutter", "--workers", "1"]
+    quick = ["--scenes", "2", "--streets", "plain", "--no-rolling-shutter", "--workers", "1"]
     killed = killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", *quick))
     whole, states = tmp_path / "killed-whole", set()
     for root in killed:

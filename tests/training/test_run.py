@@ -9,6 +9,7 @@ import functools
 import io
 import json
 import os
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -26,7 +27,7 @@ from tiny_run import CONFIG, FRAMES, SENSOR, STEPS, TESTS, bits, train_tiny, wei
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, load_state, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import exit_code
-from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
+from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.input_pipeline import loader
@@ -103,17 +104,52 @@ def test_initial_weights_of_another_coding_are_reported(finished, tmp_path, caps
     assert not any(line.startswith("warning: ") for line in lines)
 
 
-def test_initial_weights_for_another_heading_or_place_are_reported(finished, capsys):
-    for turn in (0, np.pi / 2):
-        sensor = dataclasses.replace(SENSOR, forward_rad=SENSOR.forward_rad - turn)
-        plan._initial_weights(build_detector(CONFIG, sensor), finished[0])
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "weights trained on clouds rotated by 90 degrees relative to these: " in line
-    plan._initial_weights(
-        build_detector(CONFIG, dataclasses.replace(SENSOR, origin_m=(1.4, 0.0, 1.6))), finished[0]
-    )
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "weights trained with the LiDAR at (0.0, 0.0, 0.0) m, here at (1.4, 0.0, 1.6) m: " in line
+OTHERS = {  # what differs from the sensor of the weights, and the warning
+    "the same": ({}, None),
+    "name": ({"name": "mine", "limit_xy_m": 20.0}, None),
+    "heading": (
+        {"forward_rad": SENSOR.forward_rad - np.pi / 2},
+        "on clouds rotated by 90 degrees relative to these: ",
+    ),
+    "place": ({"origin_m": (1.4, 0, 1.6)}, r"with the LiDAR at \(0.0, 0.0, 0.0\) m, here at \(1.4, 0, 1.6\) m: "),
+    "columns": (
+        {"name": "fine", "num_columns": 128},
+        r"for sensor 'tiny' .*, here sensor 'fine' \(16 beams, 128 columns\): the arrays fit, but not the beams",
+    ),
+    "beams": (
+        {"name": "few", "inclinations_rad": SENSOR.inclinations_rad[::2]},
+        r"for sensor 'tiny' \(16 beams, 64 columns\), here sensor 'few' \(8 beams, 64 columns\): ",
+    ),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_initial_weights_of_another_sensor_are_reported(finished, capsys, other):
+    changes, message = OTHERS[other]
+    plan._initial_weights(build_detector(CONFIG, dataclasses.replace(SENSOR, **changes)), finished[0])
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == (message is not None)
+    assert all(re.search(f"^warning: .*: weights trained {message}", line) for line in lines)
+
+
+@pytest.mark.parametrize("classes", [("car",), NUSCENES_CLASSES[::-1]])
+def test_initial_weights_for_other_classes_are_taken_where_they_fit(finished, capsys, classes):
+    detector = build_detector(dataclasses.replace(CONFIG, classes=classes), SENSOR)
+    given, taken = load_checkpoint(finished[0]).variables, plan._initial_weights(detector, finished[0])
+    assert bits(given["params"]["norm"]) == bits(taken["params"]["norm"])
+    assert bits(given["params"]["predictions"]) != bits(taken["params"]["predictions"])
+    assert "these start with random weights: predictions (2 of 2 arrays)" in capsys.readouterr().err
+
+
+def test_the_hook_of_the_page_stops_a_run_without_better_scores(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text()
+    exec(re.search(r"```python\n(import signal\n.*?)```", page, re.DOTALL)[1], given := {})
+    monkeypatch.setattr(runs, "_evaluate", lambda _, number, *rest: {"test/mAP": min(number, 3) / 10})
+    options = {"tests": TESTS, "weights": weights(), "hooks": [given["stop_early"]]}
+    with pytest.raises(KeyboardInterrupt):
+        train_tiny(tmp_path / "run", steps=20, evaluate=1, **options)
+    assert given["scores"] == [0.1, 0.2, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3]
+    assert checkpoint_names(tmp_path / "run")[-1] == "00000009"  # the step after the sixth that is not better
 
 
 def test_all_documented_metrics_are_recorded(finished):
@@ -164,6 +200,7 @@ def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished
         assert picture.read_bytes().startswith(b"\x89PNG")
     last = load_checkpoint(folder / "checkpoints" / "00000004")
     spec = json.loads((folder / "run.json").read_text())
+    assert spec["config"]["sensor"] == spec["sensor"]["name"] == "tiny" != CONFIG.sensor
     assert (spec["data"], spec["frames"], spec["steps"]) == (FRAMES.fingerprint(), 12, STEPS)
     assert json.loads(last.data) == {name: spec[name] for name in ("data", "frames", "weights")}
     assert (last.step, last.score) == (4, maps[4])
@@ -502,7 +539,7 @@ def test_a_different_ground_truth_database_of_the_same_frames_is_refused(begun, 
     first, other = (prepare_database(FRAMES, tmp_path / str(n), min_points=n) for n in (6, 5))
     assert first.manifest.source == other.manifest.source
     spec = json.loads((begun / "run.json").read_text()) | {"objects": first.manifest.source}
-    spec |= {"config": config_to_json(config), "ground_truth_database": first.fingerprint()}
+    spec |= {"config": plan.recorded_config(config, FRAMES), "ground_truth_database": first.fingerprint()}
     (begun / "run.json").write_text(json.dumps(spec))
     message = f"ground_truth_database: was '{first.fingerprint()}', got '{other.fingerprint()}': only the same run"
     with pytest.raises(ValueError, match=message):
@@ -560,6 +597,19 @@ def test_a_run_that_is_killed_during_an_evaluation_repeats_it_on_resume(finished
 def test_single_sweeps_are_reported_if_several_are_configured(tmp_path, capsys):
     train_tiny(tmp_path / "run", config=dataclasses.replace(CONFIG, num_sweeps=3), steps=1)
     assert "warning: num_sweeps: got 3, but the frames hold one sweep each: expected 1" in capsys.readouterr().err
+
+
+class PartialFrames(InMemoryFrames):
+    def check_files(self, indices):
+        raise ValueError(f"{len([*indices])} keyframes are missing")
+
+
+@pytest.mark.parametrize("which", ["frames", "tests"])
+def test_missing_files_are_refused_before_the_first_step(tmp_path, which):
+    partial = PartialFrames(tuple(FRAMES.frame(i) for i in range(2)), FRAMES.sensor, FRAMES.classes)
+    with pytest.raises(ValueError, match="2 keyframes are missing"):
+        train_tiny(tmp_path / "run", **{"tests": TESTS, which: partial})
+    assert not (tmp_path / "run").exists()
 
 
 class UnreadableFrames(InMemoryFrames):

@@ -1,15 +1,20 @@
 """The training step is finite and compiled once, its schedules are exact, and a short run learns a frame."""
 
+import collections
 import dataclasses
 import functools
 import inspect
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import oracles
 import pytest
-from tiny_run import TINY_CONFIG
+import tiny_peer
+from tiny_run import TINY_CONFIG, TINY_REFINED, weights
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.coding import encode
@@ -269,24 +274,6 @@ def four_frames() -> Batch:
 
 
 @pytest.mark.slow
-def test_micro_batches_and_samples_without_boxes_do_not_change_the_box_losses():
-    detector, batch = toy_detector(), four_frames()
-    params = detector.init(jax.random.key(0))["params"]
-    copies = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 4, axis=0), batch)
-    one = dataclasses.replace(copies, box_valid=copies.box_valid & np.array([[True], [False], [False], [False]]))
-    metrics = []
-    for accumulate in (1, 2):
-        config = with_optimizer(batch_size=4, accumulate=accumulate)
-        gradient = jax.jit(make_gradient(toy_detector(config)))
-        metrics += [gradient(params, {}, samples)[2] for samples in (one, copies)]
-    assert [int(each["positives"]) for each in metrics] == [int(metrics[0]["positives"]) * n for n in (1, 4, 1, 4)]
-    for part in ("l1", "iou", "iou_prediction"):
-        losses = [each[f"loss/{part}"] for each in metrics]
-        assert losses[0] > 0
-        np.testing.assert_allclose(losses, [losses[0]] * 4, rtol=1e-4)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("axes", "micro_batches"), [("lidar", (1, 2)), ("ray", (1,))])
 def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches):
     """Compares with NumPy, with and without micro-batches: cross-entropy over positives, L1 over candidates."""
@@ -434,6 +421,38 @@ def squares():
     return detector, batch, row_lists
 
 
+RATE = optax.inject_hyperparams(optax.sgd)(learning_rate=0.125)
+OPTIMIZERS = {  # the steps until the first update, and the hyperparameters that are reported
+    "adam": (optax.adam(0.1), 1, {}),
+    "sgd": (optax.sgd(0.1, momentum=0.9), 1, {}),
+    "lion": (optax.lion(0.1), 1, {}),
+    "MultiSteps": (optax.MultiSteps(RATE, 2), 2, {"learning_rate": 0.125}),
+    "inject_hyperparams": (RATE, 1, {"learning_rate": 0.125}),
+    "partition": (optax.partition({"all": RATE}, {"w": "all"}), 1, {"all/learning_rate": 0.125}),
+    "reduce_on_plateau": (optax.chain(optax.sgd(0.1), optax.contrib.reduce_on_plateau()), 1, {}),
+    "make_optimizer": (make_optimizer(OptimizerConfig(), 10), 1, {"learning_rate": 1e-3, "b1": 0.95}),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_a_step_works_with_any_optimizer_and_reports_its_hyperparameters(squares, name):
+    optimizer, until, expected = OPTIMIZERS[name]
+    detector, batch = squares[0](with_optimizer(ema_decay=0.0, batch_size=8)), squares[1]
+    state = make_state(detector, optimizer, jax.random.key(0), variables=ZERO)
+    step, traces = counted(make_train_step(detector, optimizer))
+    for number in range(1, until + 1):
+        state, metrics = step(state, batch)
+        assert (float(state.params["w"]) > 0) == (number == until)
+    assert len(traces) == 1
+    assert metrics.keys() - {"loss/total", "loss/classification", "mean", "gradient_norm"} == {
+        "positives",
+        "dropped_points",
+        *expected,
+    }
+    for key, value in expected.items():
+        assert float(metrics[key]) == pytest.approx(value)
+
+
 @pytest.mark.parametrize("num_micro", [1, 2, 8])
 def test_gradients_are_divided_by_all_positives_and_micro_batches_are_strided(squares, num_micro):
     """By hand: the gradient is the mean of 2 (w - x) over all boxes."""
@@ -491,3 +510,33 @@ def test_a_loss_that_is_not_finite_stops_the_run_before_a_pause(squares):
     with pytest.raises(NonFiniteLossError, match=r"^step 2: not finite: .*total inf.*; samples: a, b$"):
         fit(step, state, host_batches(squares[1]), num_steps=STEPS, **options)
     assert paused == [1]
+
+
+GROUPED = dataclasses.replace(
+    tiny_peer.CONFIG, pillars=dataclasses.replace(tiny_peer.CONFIG.pillars, groups=(0,) * 5 + (1,) * 5)
+)
+CAR = ("car",)
+CLASSES = {  # the weights, and the part of the network and its arrays that other classes start anew
+    "fewer": (TINY_CONFIG, CAR, {"heads": 12}),
+    "another order": (TINY_CONFIG, NUSCENES_CLASSES[::-1], {"heads": 12}),
+    "a second look": (TINY_REFINED, CAR, {"heads": 12, "refinement": 3}),
+    "CenterPoint": (tiny_peer.CONFIG, CAR, {"heads": 2}),
+    "groups": (GROUPED, NUSCENES_CLASSES[::-1], {"heads": 4}),
+}
+
+
+@pytest.mark.parametrize("case", CLASSES)
+def test_weights_for_other_classes_keep_all_arrays_that_do_not_depend_on_them(capsys, case):
+    config, classes, anew = CLASSES[case]
+    given = weights(config)
+    detector = build_detector(dataclasses.replace(config, classes=classes), TINY)
+    taken = plan._for_other_classes(Path("start"), config.classes, given, detector)
+    assert jax.tree.structure(taken) == jax.tree.structure(given)
+    pairs = zip(jax.tree.leaves_with_path(given), jax.tree.leaves(taken), strict=True)
+    changed = [path[1].key for (path, old), new in pairs if not np.array_equal(old, new)]
+    assert collections.Counter(changed) == anew
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"start: weights for other classes ({', '.join(NUSCENES_CLASSES)}): these start with")
+    assert re.findall(r"(\w+) \((\d+) of \d+ arrays\)", line) == [(k, str(v)) for k, v in anew.items()]
+    shapes = jax.tree.map(jnp.shape, jax.eval_shape(detector.init, jax.random.key(0)))
+    assert jax.tree.map(jnp.shape, taken) == shapes

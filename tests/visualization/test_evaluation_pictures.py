@@ -1,5 +1,6 @@
 """Check the contents of evaluation pictures by inspecting the figures."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,8 +10,8 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.visualization import bev, evaluation_report, range_image
-from fcos_lidar_jax.visualization.figure import class_color
+from fcos_lidar_jax.visualization import bev, drive, evaluation_report, range_image
+from fcos_lidar_jax.visualization.figure import class_color, new_figure
 
 RECALL = np.linspace(0, 1, 101).tolist()
 
@@ -103,6 +104,50 @@ def test_class_and_score_stand_beside_boxes_without_overlaps(drawn, monkeypatch)
     beside = np.abs(np.array(spans[-1].min + spans[-1].max) / 2 - centre)
     assert (beside > half - centre).any()
     assert beside.max() < 80  # pixels
+
+
+def test_in_crowds_only_the_labels_of_the_best_ten_cover_other_boxes(drawn):
+    """Of 36 pedestrians at elbow's length, with one apart who has the lowest score."""
+    grid = [(3.0 * i, 1.2 * k) for i in range(6) for k in range(6)]
+    boxes = boxes_at(*grid, (-20, -15))
+    boxes[:, 3:5] = 0.8
+    scores = np.linspace(0.9, 0.3, 37)
+    found = boxes, np.full(37, NUSCENES_CLASSES.index("pedestrian")), scores
+    bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=25, classes=NUSCENES_CLASSES, detections=found)
+    [figure] = drawn
+    figure.canvas.draw()
+    axis = figure.axes[0]
+    corners = np.stack([boxes[:, :2] - 0.4, boxes[:, :2] + 0.4], axis=1)
+    corners = axis.transData.transform(corners.reshape(-1, 2)).reshape(-1, 2, 2)
+    covering = []
+    for text in axis.texts:
+        low, high = text.get_window_extent().get_points()  # pixels; beside its own box there is a gap of two
+        inner = (corners[:, 0] < high - 3).all(axis=1) & (corners[:, 1] > low + 3).all(axis=1)
+        covering += [float(text.get_text().split()[-1])] * bool(inner.any())
+    assert covering
+    assert min(covering) >= scores[9].round(2)
+    assert len(axis.texts) > len(covering)
+    assert axis.texts[-1].get_text() == "pedestrian 0.30"
+
+
+def test_the_pictures_of_a_sample_name_it(drawn):
+    frame, found = make_frame(0, TINY), (np.zeros((0, 9)), np.zeros(0, int), np.zeros(0))
+    example = evaluation_report.Example(
+        "worst", "scene-7 frame 3", frame.points, found, (frame.boxes, frame.labels)
+    )
+    ranges_m = dict.fromkeys(NUSCENES_CLASSES, 20.0)
+    views, images = evaluation_report._draw_examples(Path(), [example], ranges_m, TINY)
+    assert [figure.axes[0].get_title() for figure in drawn[:1]] == ["worst sample: scene-7 frame 3"]
+    assert drawn[1]._suptitle.get_text() == "worst sample: scene-7 frame 3"
+    assert all("scene-7 frame 3" in caption for caption, _ in (*views, *images[1:]))
+
+
+def test_the_ranges_of_a_drive_have_a_colour_bar_of_metres():
+    figure = new_figure(8, 2)
+    drive._draw_ranges(figure.subplots(), make_frame(0, TINY).points, 20_000, TINY)
+    _, bar = figure.axes
+    assert bar.get_ylabel() == "range [m]"
+    assert {"5", "10", "20"} <= {label.get_text() for label in bar.get_yticklabels()}
 
 
 def test_the_view_fits_points_to_one_side_and_their_boxes_but_no_full_turn(drawn):

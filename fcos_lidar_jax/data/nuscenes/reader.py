@@ -1,6 +1,7 @@
 """nuScenes: keyframes with fused sweeps and boxes in the LiDAR frame, from the official tables."""
 
 import dataclasses
+import functools
 import os
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -78,9 +79,7 @@ class NuScenes:
         self.follow_links = follow_links
         if not self.root.is_dir():
             raise ValueError(f"{root}: no such folder, expected a data root")
-        if not self.tables.is_dir():
-            there = sorted(p.parent.name for p in self.root.glob("*/sample.json"))
-            raise ValueError(f"{self.tables}: no such folder, expected one of {', '.join(there) or 'none here'}")
+        check_version(self.root, version)
         folder = default_index(root, version) if index is None else Path(index)
         known = index is not None or has_index(folder)
         self.index: Index = open_index(folder, tables=self.tables) if known else build_index(self.tables)
@@ -142,10 +141,13 @@ class NuScenes:
         With ``allow_missing_sweeps``, sweeps without a file are skipped, but never a keyframe.
 
         Raises:
-            ValueError: no such scene; the message lists the scenes.
+            ValueError: no such scene, the message lists the scenes; or a file cannot be read, before the first is.
         """
         own = self._keyframe_rows(scene)
-        return map(self._read, own if keyframes else self._present(self._scene_rows(scene), keep=own))
+        rows = own if keyframes else self._present(self._scene_rows(scene), keep=own)
+        for row in rows:
+            self._expect_file(row)
+        return map(self._read, rows)
 
     def skipped_sweeps(self, scene: str) -> tuple[int, int]:
         """Number of sweeps that :meth:`drive` skips in a scene, and number of all its sweeps."""
@@ -210,6 +212,40 @@ class NuScenes:
         files = {file for token in sample_tokens for file in self.sweep_files(token, num)}
         return sum(not os.path.isfile(file) for file in files)
 
+    def incomplete(self, sample_tokens: Iterable[str], num: int = 10) -> dict[str, Path]:
+        """Keyframes of which files are missing -> the newest one; links out of the root are refused."""
+        inside = functools.cache(lambda place: check_inside(place, self.root, str(place)))
+
+        @functools.cache
+        def is_present(row: int) -> bool:
+            path = self._path(row)
+            found = os.path.isfile(path)
+            if found and not self.follow_links:  # looking at every folder only once saves most of the time
+                inside(path if path.is_symlink() else path.parent)
+            return found
+
+        lost = dict[str, Path]()
+        for token in sample_tokens:
+            own, *older = self._chain(self._sweep(token), num)
+            gone = [row for row in (own, *older) if not is_present(row)]
+            if gone and (gone[0] == own or not self.allow_missing_sweeps):
+                lost[token] = self._path(gone[0])
+        return lost
+
+    def check_files(self, sample_tokens: Collection[str], num: int = 10) -> None:
+        """Refuse :meth:`incomplete` keyframes in one line that counts them and names the scenes without any."""
+        if not (lost := self.incomplete(sample_tokens, num)):
+            return
+        own = sum(file == self._path(self._sweep(token)) for token, file in lost.items())
+        what = str(own) if own else f"older sweeps of {len(lost)}"
+        rest = "" if own else ", or --allow-missing-sweeps for fewer sweeps"
+        broken, scenes = (dict.fromkeys(map(self.scene_of, tokens)) for tokens in (lost, sample_tokens))
+        if whole := [scene for scene in scenes if scene not in broken]:
+            listed = ", ".join(whole[:20]) + ("" if len(whole) <= 20 else f" and {len(whole) - 20} more")
+            rest += f", or --splits with a file of whole scenes ({len(whole)} of {len(scenes)}): {listed}"
+        found = f"{what} of {len(sample_tokens)} keyframes are missing, such as {next(iter(lost.values()))}"
+        raise ValueError(f"{self.root}: {found}: expected the rest of the download{rest}")
+
     def sweep_files(self, sample_token: str, num: int = 10) -> list[Path]:
         """Files of the sweeps up to a keyframe, the current one first, even if they are missing."""
         return [self._path(row) for row in self._chain(self._sweep(sample_token), num)]
@@ -255,7 +291,7 @@ class NuScenes:
             return rows
         return [row for row in rows if row in keep or os.path.isfile(self._path(row))]
 
-    def _read(self, row: int) -> Sweep:
+    def _expect_file(self, row: int) -> Path:
         path = self._path(row)
         if not os.path.isfile(path):
             needed = self.allow_missing_sweeps or row in self.index.sample_sweep  # keyframes are never skipped
@@ -263,6 +299,10 @@ class NuScenes:
             raise ValueError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
         if not self.follow_links:
             check_inside(path, self.root, str(path))
+        return path
+
+    def _read(self, row: int) -> Sweep:
+        path = self._expect_file(row)
         size = path.stat().st_size
         if size == 0 or size % (4 * _COLUMNS) or size > 4 * _COLUMNS * MAX_POINTS:
             found = "an empty file" if size == 0 else f"{size} bytes"
@@ -308,14 +348,25 @@ class NuScenesFrames(FrameSet):
     def scene(self, index: int) -> str:
         return self.nuscenes.scene_of(self.tokens[index])
 
+    def check_files(self, indices: Iterable[int]) -> None:
+        self.nuscenes.check_files([self.tokens[index] for index in indices], self.reading.num_sweeps)
+
     def clouds_fingerprint(self, indices: Iterable[int]) -> str:
-        tokens, number = (self.tokens[index] for index in indices), self.reading.num_sweeps
+        tokens, number = [self.tokens[index] for index in indices], self.reading.num_sweeps
+        self.nuscenes.check_files(tokens, number)
         files = {file for token in tokens for file in self.nuscenes.sweep_files(token, number)}
         return files_fingerprint(files, self.nuscenes.root, None)
 
     def fingerprint(self) -> str:
         how = dataclasses.astuple(self.reading)
         return checksum(repr((column_checksums(self.nuscenes.index), self.tokens, how)).encode())
+
+
+def check_version(root: Path, version: str) -> None:
+    """Refuse a version without a folder in the root; the message lists those that there are."""
+    if not (root / version).is_dir():
+        there = sorted(file.parent.name for file in root.glob("*/sample.json"))
+        raise ValueError(f"{root / version}: no such folder, expected one of {', '.join(there) or 'none here'}")
 
 
 def open_keyframes(
