@@ -66,9 +66,6 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
 
     Raises:
         SystemExit: with 143 or 129 after SIGTERM or SIGHUP, or raised by ``work``.
-
-    >>> exit_code("example", lambda: 0)
-    0
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # standard error already escapes what it cannot encode
         with contextlib.suppress(OSError):  # a full disk is reported below

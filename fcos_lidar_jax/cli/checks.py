@@ -11,11 +11,7 @@ from fcos_lidar_jax.files import check_writable
 
 
 def option_name(field: str) -> str:
-    """Name of a field's option as it is typed.
-
-    >>> option_name("batch_size")
-    '--batch-size'
-    """
+    """Name of a field's option as it is typed, such as ``--batch-size``."""
     return f"--{field.replace('_', '-')}"
 
 

@@ -87,6 +87,7 @@ def open_sinks(
     """
     result, views = _result(args, classes, in_lines=in_lines), list[Callable[..., object]]()
     frames, min_score = list[PageFrame](), SHOWN_SCORE if args.min_score is None else args.min_score
+    tracked = getattr(args, "track", False)
     with contextlib.ExitStack() as stack:
         write = stack.enter_context(result)
         if args.page is not None:
@@ -99,7 +100,7 @@ def open_sinks(
         def add(record: Record, points: np.ndarray) -> None:
             write({**record, **(more or {})})
             if views:
-                found, details = read_boxes(record, classes), _details(record)
+                found, details = read_boxes(record, classes), _details(record, tracked=tracked)
                 for view in views:
                     view(points, found, **details)
 
@@ -120,13 +121,13 @@ def closing_at_failure(sinks: contextlib.ExitStack, done: Sized) -> Iterator[Non
         raise
 
 
-def _details(record: Record) -> dict[str, Any]:
+def _details(record: Record, *, tracked: bool) -> dict[str, Any]:
     """The name and, in a drive, time, pose and track numbers, as pages and recordings take them."""
     details: dict[str, Any] = {"name": Path(record["file"]).name}
     if (pose := record.get("sensor_to_world")) is not None:
         details |= {"time_us": record["timestamp_us"], "pose": np.array(pose)}
-    if any("track" in box for box in record["boxes"]):
-        details["ids"] = np.array([box["track"] for box in record["boxes"]])
+    if tracked:
+        details["ids"] = np.array([box["track"] for box in record["boxes"]], np.int64)
     return details
 
 

@@ -20,11 +20,7 @@ _MIRRORS = {"none": ("",), "x": ("", "x"), "y": ("", "y"), "xy": ("", "x", "y", 
 
 
 class Stages(NamedTuple):
-    """Stages of detection in one cloud, as pure functions.
-
-    >>> Stages._fields
-    ('prepare', 'network', 'candidates', 'postprocess', 'refine')
-    """
+    """Stages of detection in one cloud, as pure functions."""
 
     prepare: Callable[..., Any]  # ``(points f32[n, c], valid bool[n]) -> input``
     network: Callable[..., Any]  # ``(variables, input) -> outputs``

@@ -17,11 +17,7 @@ _TABLE_ROWS = 20
 
 
 class DetectedBox(NamedTuple):
-    """One box.
-
-    >>> DetectedBox("car", 0.5, np.array([8, 0, 0, 4, 2, 1.5, 0, 0, 0])).name
-    'car'
-    """
+    """One box."""
 
     name: str  # class
     score: float

@@ -35,13 +35,7 @@ Rows = np.ndarray | jax.Array | Sequence[Any]
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)  # equality of weights would be slow
 class CloudDetector(abc.ABC):
-    """A detector from a checkpoint or an exported file, which maps point clouds to boxes.
-
-    >>> from fcos_lidar_jax.inference import load_detector
-    >>> detector = load_detector("quickstart")
-    >>> detector.sensor.name, len(detector.classes)
-    ('short_range', 10)
-    """
+    """A detector from a checkpoint or an exported file, which maps point clouds to boxes."""
 
     model: Detector  # functions of the network, with its configuration and sensor
 
@@ -154,12 +148,7 @@ def _scaled_once(points: Rows, sensor: Sensor) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class TrainedDetector(CloudDetector):
-    """A network with its weights.
-
-    >>> from fcos_lidar_jax.inference import load_trained
-    >>> sorted(load_trained("quickstart").variables)
-    ['batch_stats', 'params']
-    """
+    """A network with its weights."""
 
     variables: Variables  # ``params`` and ``batch_stats``
     _placed: dict[Mesh, Any] = dataclasses.field(default_factory=dict, init=False, repr=False, compare=False)
@@ -180,22 +169,13 @@ class TrainedDetector(CloudDetector):
 
         Raises:
             ValueError: an invalid value, or flips that were not used in training.
-
-        >>> from fcos_lidar_jax.inference import load_trained
-        >>> load_trained("hdl32e").with_inference(merge_iou=None).config.inference.merge_iou is None
-        True
         """
         inference = dataclasses.replace(self.config.inference, **fields)
         config = dataclasses.replace(self.config, inference=inference)
         return dataclasses.replace(self, model=build_detector(config, self.sensor))
 
     def without_second_look(self) -> "TrainedDetector":
-        """Remove the second look: the result has the boxes and scores of the detector itself.
-
-        >>> from fcos_lidar_jax.inference import load_trained
-        >>> load_trained("hdl32e").without_second_look().config.refinement is None
-        True
-        """
+        """Remove the second look: the result has the boxes and scores of the detector itself."""
         model = build_detector(dataclasses.replace(self.config, refinement=None), self.sensor)
         return TrainedDetector(model, without_second_look(self.variables))
 

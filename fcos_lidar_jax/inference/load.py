@@ -38,10 +38,6 @@ def load_detector(checkpoint: str | Path, *, backend: Backend = "xla") -> CloudD
 
 
 def load_trained(checkpoint: str | Path) -> TrainedDetector:
-    """Load a detector with access to its weights, from anything :func:`load_detector` takes but exported files.
-
-    >>> load_trained("quickstart").config.name
-    'quickstart'
-    """
+    """Load a detector with access to its weights, from anything :func:`load_detector` takes but exported files."""
     loaded = load_checkpoint(checkpoint)
     return TrainedDetector(build_detector(loaded.config, loaded.sensor), loaded.variables)

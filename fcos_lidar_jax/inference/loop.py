@@ -26,12 +26,7 @@ _Loaded = dict[int, tuple[Frame, Cloud]]  # by row of the batch, without rows th
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
-    """Detections in one frame.
-
-    >>> nothing = Detections(*np.zeros((3, 0)), valid=np.zeros(0, bool), num_dropped=np.int32(0))
-    >>> Prediction(7, nothing, frame=None, cloud=None).detections.valid.sum()
-    np.int64(0)
-    """
+    """Detections in one frame."""
 
     index: int  # index of the frame
     detections: Detections  # NumPy arrays, in the frame of the data

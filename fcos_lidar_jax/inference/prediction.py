@@ -73,12 +73,6 @@ def evaluate(
 
     Returns:
         scores over the classes of the detector, see :func:`fcos_lidar_jax.evaluation.frames.evaluate_frames`.
-
-    >>> from fcos_lidar_jax.inference import load_detector
-    >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
-    >>> detector = load_detector("quickstart")
-    >>> 0 <= evaluate(detector, unseen_frames(detector.sensor, 2)).summary["mean_ap"] <= 1
-    True
     """
     mapped = MappedFrames(frames, detector.classes)
     progress = Progress("test frames", len(mapped))

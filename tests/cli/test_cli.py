@@ -194,7 +194,6 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
     assert png.stat().st_size > 10_000
 
 
-# Each with "--checkpoint HOME/checkpoint" for detect and "--out OUT" unless it says otherwise.
 @pytest.mark.parametrize("line", ["detct", "detect --checkpiont x", "project", "demo --drive many"])
 def test_usage_errors_exit_with_2(line):
     with pytest.raises(SystemExit) as stopped:

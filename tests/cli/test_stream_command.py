@@ -255,14 +255,6 @@ def test_the_first_sweep_with_points_tells_another_sensor(home, tmp_path, capsys
     assert capsys.readouterr().err.count("no intensity is above 1") == 1
 
 
-def test_a_recording_for_rerun(home, tmp_path):
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    file = tmp_path / "drive.rrd"
-    lines = stream(home, tmp_path / "b.jsonl", home / "drive", "--poses", home / "poses.json", "--rrd", file)
-    assert file.read_bytes()[:3] == b"RRF"
-    assert len(lines) == SWEEPS
-
-
 def test_sweeps_out_of_order_are_kept_without_poses_and_skipped_with_them(home, tmp_path, capsys):
     cloud, times = structured(make_frame(0, TINY).points), [5000, 4000, 0, 5000, 6000]
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: (("/p", make.cloud(t, cloud)) for t in times))
