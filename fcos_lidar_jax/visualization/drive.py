@@ -15,7 +15,7 @@ from fcos_lidar_jax.visualization.bev import bev_on, class_legend
 from fcos_lidar_jax.visualization.evaluation_report import Example
 from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set_title
 
-_SIZE_IN = (8.6, 9.6)
+_SIZE_IN = (8.3, 9.6)
 _DPI = 90
 _SCENE_S = 0.5  # duration of each scene
 _COLORS = 96  # colours of the GIF; more colours increase its size but hardly its quality
