@@ -79,6 +79,7 @@ class Detect:
     rrd: options.Rrd = None
     columns: options.Columns = None
     dtype: options.Dtype = None
+    viewpoint: options.Viewpoint = False
     max_file_points: options.MaxFilePoints = MAX_POINTS
     batch_size: options.BatchSize = 1
     backend: options.Backend = "xla"
@@ -158,6 +159,7 @@ def _clouds(args: Detect, files: tuple[Path, ...], detector: CloudDetector, sens
         dataclasses.replace(reading, remove_close=args.remove_close or reading.remove_close),
         columns=args.columns,
         dtype=args.dtype,
+        viewpoint=args.viewpoint,
         max_points=args.max_file_points,
         full_turn=args.full_turn,
     )
@@ -173,7 +175,7 @@ def _resume_log(args: Detect, detector: CloudDetector, aligned: Alignment) -> It
     """The log of the files that an interrupted call with the same options has finished; deleted in the end."""
     file = _log_file(args)
     same = args.remove_close, args.columns, args.dtype, args.min_score, args.labels, args.batch_size
-    same += sensor_to_json(aligned.data), aligned.yaw_rad, args.full_turn
+    same += sensor_to_json(aligned.data), aligned.yaw_rad, args.full_turn, args.viewpoint
     with file_lock(file) as held:
         if not held:
             raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")

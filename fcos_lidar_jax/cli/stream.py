@@ -35,7 +35,7 @@ from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
 _OPTIONS = {
-    **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype")},
+    **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype", "viewpoint")},
     **{name: name for name in ("version", "index", "keyframes", "allow_missing_sweeps", "follow_links")},
     "max_file_points": "max_points",
 }
@@ -95,6 +95,7 @@ class Stream:
     backend: options.Backend = "xla"
     columns: options.Columns = None
     dtype: options.Dtype = None
+    viewpoint: options.Viewpoint = False
     max_file_points: options.MaxFilePoints = MAX_POINTS
 
 

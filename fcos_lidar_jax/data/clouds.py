@@ -26,6 +26,7 @@ class CloudFiles(FrameSet):
     dtype: str | None = None  # of raw files in another layout
     max_points: int = MAX_POINTS  # larger clouds are refused
     full_turn: bool = False  # keep the points of KITTI's files outside the camera image
+    viewpoint: bool = False  # of .pcd files: apply it
     classes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -33,7 +34,7 @@ class CloudFiles(FrameSet):
 
     def frame(self, index: int) -> Frame:
         file = self.files[index]
-        layout: dict[str, Any] = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
+        layout = {name: getattr(self, name) for name in ("columns", "dtype", "max_points", "viewpoint")}
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
@@ -61,7 +62,7 @@ class CloudFiles(FrameSet):
         return [file] if calibration is None else [file, calibration]
 
     def fingerprint(self) -> str:
-        reading = self.files, self.sensor, self.reading, self.columns, self.dtype, self.full_turn
+        reading = self.files, self.sensor, self.reading, self.columns, self.dtype, self.full_turn, self.viewpoint
         files = {file for index in range(len(self)) for file in self.sources(index)}
         return files_fingerprint(files, Path("/"), reading)
 
@@ -74,7 +75,7 @@ def read_cloud(
     KITTI's files are cropped by :func:`~fcos_lidar_jax.data.kitti.in_camera`, unless ``full_turn``. ``layout`` are
     options of :func:`~fcos_lidar_jax.data.point_files.read_points`.
     """
-    points = read_points(file, sensor, **layout)
+    points = read_points(file, sensor, num_sweeps=reading.num_sweeps, **layout)
     return drop_close(points if full_turn else in_camera(Path(file), points), sensor, reading)
 
 

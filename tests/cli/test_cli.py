@@ -54,6 +54,7 @@ def home(tmp_path_factory):
     np.save(folder / "pickled.npy", np.array([{"a": 1}], object), allow_pickle=True)
     np.save(folder / "flat.npy", np.zeros(4, np.float32))
     np.save(folder / "future.npy", np.full((4, 5), -1.0, np.float32))
+    np.save(folder / "scaled_ring.npy", np.column_stack([points[:, :4], np.arange(len(points)) % 16 / 15]))
     (folder / "nothing").mkdir()
     (folder / "link.json").symlink_to("good.npy")
     (folder / "empty.bin").write_bytes(b"")
@@ -76,7 +77,8 @@ def files_of(out):
 def test_detect_writes_boxes_pictures_and_a_page(home, tmp_path, capsys):
     out, clouds, page = tmp_path / "boxes.json", [home / "good.npy", home / "nan.npy"], tmp_path / "page.html"
     command(*detect(home, *clouds, "--out", out, "--pictures", tmp_path, "--page", page))
-    progress = capsys.readouterr().err.strip().splitlines()
+    note, *progress = capsys.readouterr().err.strip().splitlines()
+    assert note.startswith("note: the heading of the clouds is not declared")
     assert len(progress) == 2
     assert "2/2" in progress[1]
     good, bad = files_of(out)
@@ -321,6 +323,13 @@ detect HOME/text.txt => unknown extension '.txt'
 detect HOME/pickled.npy => pickled.npy: not a readable .npy
 detect HOME/flat.npy => flat.npy: shape
 detect HOME/future.npy => future.npy: time_lag
+detect HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* 1 \(num_sweeps\): .*--columns
+project HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* at most 10 \(num_sweeps\)
+stream HOME/scaled_ring.npy --checkpoint HOME/checkpoint => scaled_ring.npy: fifth column: got 16 .* at most 1
+benchmark HOME/scaled_ring.npy --checkpoint HOME/checkpoint => scaled_ring.npy: fifth column: got 16 .* at most 1
+detect HOME/good.npy --viewpoint => good.npy: viewpoint: expected a .pcd file
+project HOME/good.npy --viewpoint => good.npy: viewpoint: expected a .pcd file
+stream HOME/good.npy --viewpoint --checkpoint HOME/checkpoint => good.npy: viewpoint: expected a .pcd file
 detect HOME/broken.pcd => broken.pcd: not a readable .pcd file
 detect HOME/away.npy => away.npy: none of its .* points is usable
 detect HOME/no_rows.npy => no_rows.npy: no points in it, expected at least one

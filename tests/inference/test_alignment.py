@@ -1,6 +1,7 @@
 """Clouds of other axes: rotated and shifted for the detector, and boxes transformed back."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,6 +55,21 @@ def test_a_sensor_with_another_number_of_rows_gives_a_warning(capsys):
     expected = "warning: vlp16 has 16 rows, and the detector's sensor 32: expect poor detections"
     assert capsys.readouterr().err.count(expected) == 1
     assert align(NUSCENES_HDL32E, dataclasses.replace(NUSCENES_HDL32E, forward_rad=0.0)).notes == ()
+
+
+def test_a_note_says_if_nothing_declares_the_heading_of_files(capsys):
+    options = "(--data-sensor, --yaw-deg)"
+    told = f"note: the heading of the clouds is not declared {options}: the detector expects y ahead\n"
+    files = [Path("a.npy")]
+    for aligned, expected in (
+        (align(TINY, paths=files), told),
+        (align(TINY, TINY, paths=files), ""),
+        (align(TINY, paths=files, yaw_rad=0.0), ""),
+        (align(VLP16, paths=files), ""),
+        (align(NUSCENES_HDL32E, paths=[Path("LIDAR_TOP/a.pcd.bin")]), ""),
+    ):
+        aligned.tell_notes()
+        assert capsys.readouterr().err == expected
 
 
 def test_a_note_says_if_only_one_heading_is_known(capsys):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from refusal import refused
 from tiny_run import TINY_CONFIG
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -377,6 +378,9 @@ def test_a_warning_names_a_frame_that_does_not_fit_the_sensor():
     made = InMemoryFrames(tuple(frames), TINY, NUSCENES_CLASSES)
     [warning] = plan._warnings(made, CONFIG)
     assert warning.startswith(f"{made.name(1)}: points do not fit")
+    frames[0].points[:, 4] = np.arange(len(frames[0].points)) % 16 / 15
+    with refused("fifth column: got 16 different values up to 1, expected the time lag", made.name(0)):
+        list(plan._warnings(made, CONFIG))
 
 
 @pytest.mark.slow
