@@ -82,7 +82,7 @@ def measure(
     Without files the clouds are simulated, and reading is not timed. Without sizes the default sizes are timed.
     """
     sensor = detector.sensor
-    read = functools.partial(read_points, sensor=sensor)
+    read = functools.partial(read_points, sensor=sensor, num_sweeps=detector.config.num_sweeps)
     arrays = [read(file) for file in files] or [make_frame(seed, sensor).points for seed in range(_NUM_SIMULATED)]
     if line := sensor_mismatch(arrays[0], sensor):
         tell(f"warning: {line}")

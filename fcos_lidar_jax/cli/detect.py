@@ -69,6 +69,7 @@ class Detect:
     rrd: options.Rrd = None
     columns: options.Columns = None
     dtype: options.Dtype = None
+    viewpoint: options.Viewpoint = False
     max_file_points: options.MaxFilePoints = MAX_POINTS
     batch_size: options.BatchSize = 1
     backend: options.Backend = "xla"
@@ -88,7 +89,7 @@ def run(args: Detect) -> None:
         line = f"fuses the first {config.num_sweeps} of {len(parts)} sweeps, as the detector was trained"
         notes = (*notes, f"{args.sweeps}: {line}")
     reading = dataclasses.replace(config.reading, remove_close=args.remove_close or config.reading.remove_close)
-    layout: dict[str, Any] = {name: getattr(args, name) for name in ("columns", "dtype", "full_turn")}
+    layout: dict[str, Any] = {name: getattr(args, name) for name in ("columns", "dtype", "full_turn", "viewpoint")}
     clouds = CloudFiles(files, aligned.data, reading, max_points=args.max_file_points, **layout)
     shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
     place = msgspec.to_builtins(sweeps[0]) if sweeps and args.output_format != "json" else None

@@ -61,6 +61,7 @@ Dtype = Annotated[
     Literal["float16", "float32", "float64"] | None,
     option("{float16,float32,float64}", default="float32", text=f"Number type {_RAW}."),
 ]
+Viewpoint = Annotated[bool, option(text="Move the points of .pcd files by the VIEWPOINT of their headers.")]
 MaxFilePoints = Annotated[int, option(text="Refuse point files with more points than this.")]
 MinScore = Annotated[
     float | None,

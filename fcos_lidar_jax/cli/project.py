@@ -40,6 +40,7 @@ class Project:
     """Drop points within a metre of the sensor in x and y: all sweeps, only older sweeps, or none."""
     columns: options.Columns = None
     dtype: options.Dtype = None
+    viewpoint: options.Viewpoint = False
     max_file_points: options.MaxFilePoints = MAX_POINTS
 
 
@@ -51,9 +52,9 @@ def run(args: Project) -> None:
     if args.png is not None:
         check_out_file("--png", args.png, keep=[args.file, args.out])
     sensor = load_sensor(args.sensor)
-    points = read_points(
-        args.file, sensor, columns=args.columns, dtype=args.dtype, max_points=args.max_file_points
-    )
+    layout = {name: getattr(args, name) for name in ("columns", "dtype", "viewpoint")}
+    limit, num_sweeps = args.max_file_points, Config.num_sweeps
+    points = read_points(args.file, sensor, max_points=limit, num_sweeps=num_sweeps, **layout)
     projection = ProjectionConfig(remove_close=args.remove_close)
     config = Config(max_points=max(len(points), 1), projection=projection)
     cloud = make_cloud(points, config, sensor=sensor)

@@ -31,7 +31,7 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, in_frame_of
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
 _OPTIONS = {
-    **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype")},
+    **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype", "viewpoint")},
     **{name: name for name in ("version", "index", "keyframes", "allow_missing_sweeps", "follow_links")},
     "max_file_points": "max_points",
 }
@@ -92,6 +92,7 @@ class Stream:
     backend: options.Backend = "xla"
     columns: options.Columns = None
     dtype: options.Dtype = None
+    viewpoint: options.Viewpoint = False
     max_file_points: options.MaxFilePoints = MAX_POINTS
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.point_files import check_time_lags
+from fcos_lidar_jax.data.point_files import MAX_TIME_LAG_S, check_num_lags, check_time_lags
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
@@ -16,7 +16,6 @@ from fcos_lidar_jax.sensors import Sensor
 MAX_INTENSITY = 65_535.0
 """On the scale 0-255; unscaled 16-bit counts reach it. One value of 1e30 would leave an infinite running variance
 in the network."""
-MAX_TIME_LAG_S = 60.0  # far above any fusion; larger values, like negative ones, are timestamps or damage
 
 _SEED = 0  # of the random choice of truncated rows
 _ORDER = "older sweeps go first, then random points"
@@ -28,9 +27,11 @@ _MAX_BEYOND = 0.9
 _MAX_OUTSIDE = 0.3
 _MAX_DENSITY = 1.7
 _MIN_NEIGHBOURS = 0.3
-"""The four bounds of :func:`sensor_mismatch`. A sensor's own clouds reach at most 0.17, 0.01, 1.05, and at least
-0.84. For most pairs of presets, one figure lies clearly on the other side; some have beams that are too alike,
-such as the VLP-16 in place of the HDL-32E."""
+_MIN_ROWS_FILLED, _MIN_ROWS_DOWN = 0.6, 0.9
+"""The six bounds of :func:`sensor_mismatch`. A sensor's own clouds reach at most 0.17, 0.01, 1.05, and at least
+0.84, 0.96 in a street and 1. For most pairs of presets, one figure lies clearly on the other side; some have beams
+that are too alike."""
+_DOWN_RAD = -0.05  # beams below reach the ground or something before it; others may only see the sky
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +67,8 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
             reader was used: close points are then removed here, and the time lags are checked.
 
     Raises:
-        ValueError: wrong number of columns; without a reader also rings instead of time lags.
+        ValueError: wrong number of columns; more time lags than ``config.num_sweeps``; without a reader also rings
+            or Unix times instead of time lags.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -78,9 +80,10 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
     valid = kept = np.asarray(usable_rows(points))
     by_reader = num_close or 0
     if num_close is None:
-        check_time_lags(points)
+        check_time_lags(points[:, 4])
         kept = np.asarray(remove_close(points, valid, sensor, config.reading))
         num_close = int((valid & ~kept).sum())
+    check_num_lags(points[:, 4], num_sweeps=config.num_sweeps)
     padded = np.zeros((config.max_points, points.shape[1]), np.float32)
     padded_valid = np.zeros(config.max_points, bool)
     num_truncated = write_points([points], kept, padded, padded_valid)
@@ -213,8 +216,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     """A warning that another sensor probably recorded a cloud, or None.
 
     Uses the current sweep: the share of points beyond the sensor's limits and outside its vertical field of view,
-    points per image cell, the share of points with a neighbour in the next column and in the next row, and the
-    scale of the intensity.
+    points per image cell, the share of points with a neighbour in the next column and in the next row, of rows
+    with points, and the scale of the intensity.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame
@@ -273,6 +276,10 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     for share, what in ((beside, "column"), (below, "row")):
         if share < _MIN_NEIGHBOURS:
             yield f"{share:.0%} of the points have a neighbour in the next {what}, expected most"
+    in_row, down = filled.sum(axis=1), np.asarray(sensor.inclinations_rad) < _DOWN_RAD
+    rows = in_row > in_row.max() / 10
+    if rows.mean() < _MIN_ROWS_FILLED and rows[down].sum() < _MIN_ROWS_DOWN * down.sum():
+        yield f"only {rows.sum()} of {len(rows)} rows have points: the cloud has far fewer beams"
 
 
 def _cells(points: np.ndarray, valid: np.ndarray, sensor: Sensor, size: int) -> np.ndarray:

@@ -27,6 +27,7 @@ class CloudFiles(FrameSet):
     dtype: str | None = None  # of raw files in another layout
     max_points: int = MAX_POINTS  # larger clouds are refused
     full_turn: bool = False  # keep the points of KITTI's files outside the camera image
+    viewpoint: bool = False  # of .pcd files: apply it
     classes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -34,7 +35,7 @@ class CloudFiles(FrameSet):
 
     def frame(self, index: int) -> Frame:
         file = self.files[index]
-        layout: dict[str, Any] = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
+        layout = {name: getattr(self, name) for name in ("columns", "dtype", "max_points", "viewpoint")}
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
@@ -62,7 +63,7 @@ class CloudFiles(FrameSet):
 
     def fingerprint(self) -> str:
         """Of how files are read; :meth:`clouds_fingerprint` is of the files."""
-        reading = self.sensor, self.reading, self.columns, self.dtype, self.full_turn
+        reading = self.sensor, self.reading, self.columns, self.dtype, self.full_turn, self.viewpoint
         return checksum(repr(reading).encode())
 
     def clouds_fingerprint(self, indices: Iterable[int]) -> str:
@@ -77,7 +78,7 @@ def read_cloud(
     KITTI's files are cropped by :func:`~fcos_lidar_jax.data.kitti.in_camera`, unless ``full_turn``. ``layout`` are
     options of :func:`~fcos_lidar_jax.data.point_files.read_points`.
     """
-    points = read_points(file, sensor, **layout)
+    points = read_points(file, sensor, num_sweeps=reading.num_sweeps, **layout)
     return drop_close(points if full_turn else in_camera(Path(file), points), sensor, reading)
 
 

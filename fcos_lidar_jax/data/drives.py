@@ -15,9 +15,12 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.sweeps import Sweep, check_poses, read_entries
 from fcos_lidar_jax.data.text_files import read_lines, read_number
 from fcos_lidar_jax.geometry import pose_matrix
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor
 
 MAX_POSE_GAP_US = 500_000  # largest distance of neighbours between which poses are interpolated
+_FASTEST_M_PER_S = 100.0  # between two poses
+_MAX_RATIO = 3  # between the numbers of points in two clouds of one sensor
 _LATEST_S = 1e12  # larger values are not timestamps
 _NANOSECOND_DIGITS = range(16, 20)  # file names with this many digits are nanoseconds
 
@@ -33,6 +36,30 @@ class Drive:
     tokens: Mapping[int, str] = dataclasses.field(default_factory=dict)  # time -> sample token of nuScenes
     notes: list[str] = dataclasses.field(default_factory=list)
     """Notes about assumptions and, once the last sweep was read, about skipped sweeps."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sweeps", _watched(self.sweeps))
+
+
+def _watched(sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
+    """The sweeps; a note tells the first that cannot follow the one before in a drive of one sensor."""
+    before: Sweep | None = None
+    for sweep in sweeps:
+        if before is not None and (line := _jump(before, sweep)):
+            tell(f"note: {sweep.name}: {line} {before.name}: clouds of several sensors or drives?", once="jump")
+        before = sweep
+        yield sweep
+
+
+def _jump(before: Sweep, sweep: Sweep) -> str | None:
+    moved_m = float(np.linalg.norm(sweep.sensor_to_world[:3, 3] - before.sensor_to_world[:3, 3]))
+    passed_s = (sweep.time_us - before.time_us) / 1e6
+    if moved_m > _FASTEST_M_PER_S * passed_s > 0:
+        return f"its pose is {moved_m:.1f} m away, {passed_s:g} s after"
+    numbers = len(before.points), len(sweep.points)
+    if max(numbers) > _MAX_RATIO * min(numbers) > 0:
+        return f"it has {numbers[1]} points, after {numbers[0]} of"
+    return None
 
 
 PoseRow = tuple[float, ...]
@@ -113,7 +140,7 @@ def folder_drive(folder: Path, sensor: Sensor, poses: Path | None = None, **layo
 
     def read() -> Iterator[Sweep]:
         for file, time_us, matrix in zip(files, times, matrices, strict=True):
-            yield Sweep(read_points(file, sensor, **layout), matrix, time_us, str(file))
+            yield Sweep(read_points(file, sensor, num_sweeps=1, **layout), matrix, time_us, str(file))
 
     return Drive(read(), posed=poses is not None, timed=poses is not None)
 

@@ -28,7 +28,6 @@ from fcos_lidar_jax.sensors import PRESETS, Sensor, load_sensor
 
 _SENSOR, _CLASSES = "sensor.json", "classes.json"
 _CLOUDS, _BOXES, _SWEEPS = "clouds", "boxes", "sweeps"
-_MAX_LAGS = 100  # far more sweeps than anybody fuses
 _Speed = Annotated[float, msgspec.Meta(ge=-LIMITS["vx"], le=LIMITS["vx"])]  # no NaN: unknown speeds are null
 
 
@@ -150,8 +149,7 @@ class FolderFrames(FrameSet):
     def _points(self, index: int, reading: CloudReading) -> tuple[np.ndarray, int]:
         cloud, listed = self._clouds[self.names[index]], self._sweeps.get(self.names[index])
         if listed is None or self.reading.num_sweeps == 1:
-            points = point_files.read_points(cloud, self.sensor)
-            _expect_sweeps(points[:, 4], cloud)
+            points = point_files.read_points(cloud, self.sensor, num_sweeps=self.reading.num_sweeps)
             return drop_close(points, self.sensor, reading)
         self.check_files([index])
         return read_sweeps(listed, self.sensor, reading)
@@ -202,14 +200,6 @@ def belongs_to_own_data(path: Path) -> bool:
         return (folder / _CLOUDS).is_dir()
     beside = {_CLOUDS: _BOXES, _BOXES: _CLOUDS, _SWEEPS: _CLOUDS}.get(folder.name)
     return beside is not None and (folder.parent / beside).is_dir()
-
-
-def _expect_sweeps(lags: np.ndarray, cloud: Path) -> None:
-    """Refuse time offsets of single points within a turn: they would turn points into older sweeps."""
-    different = len(np.unique(lags[np.isfinite(lags)]))
-    if different > _MAX_LAGS:
-        found = f"got {different} different time lags, which look like offsets within a turn"
-        raise ValueError(f"{cloud}: fifth column: {found}, expected one per sweep, 0 for the current one")
 
 
 def _list_files(root: Path, folder: str, endings: tuple[str, ...], inside: Path | None) -> dict[str, Path]:

@@ -104,7 +104,7 @@ class InMemoryFrames(FrameSet):
     """Frames in memory.
 
     Raises:
-        ValueError: a label is not the index of a class, or the fifth column of the points is a ring.
+        ValueError: a label is not the index of a class, or the fifth column of the points is no time lag.
     """
 
     frames: tuple[Frame, ...]
@@ -116,7 +116,7 @@ class InMemoryFrames(FrameSet):
             known = (frame.labels >= 0) & (frame.labels < len(self.classes))
             expected = f"indices of the {len(self.classes)} classes"
             check(bool(known.all()), f"frame {index}: labels", frame.labels[~known].tolist(), expected)
-            check_time_lags(frame.points, f"frame {index}: points")
+            check_time_lags(frame.points[:, 4:5], f"frame {index}: points")
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -2,26 +2,37 @@
 
 import contextlib
 import dataclasses
+import math
 import re
 from collections.abc import Sequence
 
 import numpy as np
 
+from fcos_lidar_jax.geometry import pose_matrix
+from fcos_lidar_jax.progress import tell
+
 _COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "time_lag")}
-_COLUMNS["intensity"] = ("intensity", "reflectivity")
+_COLUMNS["intensity"] = ("intensity", "reflectivity", "intensities", "remission", "scalar_intensity", "i")
 _COLUMNS["laser"] = ("laser_number", "laser", "ring", "line", "channel")
 """Column -> its field names in various drivers, the most specific first. Other fields are skipped."""
+_LIKE_INTENSITY = re.compile("intens|refl|remiss|signal|amplitude")
+_NOT_A_NUMBER = re.compile(rb"(?i)-?(?:nan\(\w*\)|1\.#\w*)")  # as Microsoft's C library writes it
+_IDENTITY = "0001000"
 _KINDS, _SIZES = {"F": "f", "I": "i", "U": "u"}, {size: size for size in "1248"}
 _SPACE, _PART_BYTES = re.compile(rb"\s"), 2**20
 _MAX_EXPANSION = 88  # three bytes of LZF unpack to 264 at most
 
 
-def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, np.ndarray]:
+def parse_pcd(
+    content: bytes, where: str = "points", *, max_points: int, max_bytes: int, viewpoint: bool = False
+) -> dict[str, np.ndarray]:
     """Parse the content of a PCD file into named columns; a ValueError says what is damaged.
 
     Args:
+        where: name of the file in notes.
         max_points: limit of the number of points.
         max_bytes: limit of all points' unpacked size.
+        viewpoint: transform x, y, z by the pose in the header; otherwise a note says that it was not used.
 
     Returns:
         x, y, z, and intensity, time_lag and laser if the file has them; one value per point, in the file's own
@@ -35,10 +46,11 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
     header, body = _read_header(content)
     try:
         fields, number = _read_fields(header), _num_points(header)
-        places = find_columns([field.name for field in fields])
+        places = find_columns([field.name for field in fields], where)
         if any(fields[place].count != 1 for place in places.values()) or number < 0:
             raise ValueError("expected one value per column and point")
         read = _FORMS[" ".join(header["DATA"]).lower()]
+        pose = _read_viewpoint(header, where, needed=viewpoint)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"damaged header: {error}") from None
     if number > max_points or number * _size(fields) > max_bytes:
@@ -46,17 +58,29 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
         raise ValueError(f"POINTS: got {size}, expected at most {max_points} and {max_bytes} bytes in all")
     if number == 0:
         return dict.fromkeys(places, np.zeros(0))
-    columns = read(body, fields, number, list(places.values()))
-    return dict(zip(places, columns, strict=True))
+    table = dict(zip(places, read(body, fields, number, list(places.values())), strict=True))
+    if viewpoint and pose is not None:
+        xyz = pose[:3, :3] @ np.array([table[axis] for axis in "xyz"], np.float64) + pose[:3, 3:]
+        table |= zip("xyz", xyz, strict=True)
+    return table
 
 
-def find_columns(names: Sequence[str]) -> dict[str, int]:
+def find_columns(names: Sequence[str], where: str = "points") -> dict[str, int]:
     """Column -> index of the first field with its most specific name; columns without a field are left out.
+
+    A note says if there is no intensity, but a field whose name looks like one.
 
     >>> find_columns(["x", "y", "z", "t", "line", "ring"])
     {'x': 0, 'y': 1, 'z': 2, 'laser': 5}
     """
+    names = [name.lower() for name in names]
     found = {column: next((a for a in aliases if a in names), None) for column, aliases in _COLUMNS.items()}
+    if found["intensity"] is None and (like := [name for name in names if _LIKE_INTENSITY.search(name)]):
+        expected = f"rename one to intensity, or intensities are 0: {', '.join(_COLUMNS['intensity'])} are read"
+        tell(
+            f"note: {where}: field {', '.join(map(repr, like[:3]))} is not read: {expected}",
+            once="field like an intensity",
+        )
     return {column: names.index(alias) for column, alias in found.items() if alias is not None}
 
 
@@ -93,13 +117,14 @@ def _size(fields: list[_Field]) -> int:
 
 
 def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
-    names = [name.lower() for name in header["FIELDS"]]
+    names = [name.lower() for name in header.get("COLUMNS") or header["FIELDS"]]  # COLUMNS before version 0.5
     if any(names.count(axis) != 1 for axis in "xyz"):
         raise ValueError(f"FIELDS: got {' '.join(names)}, expected x, y and z, each once")
-    counts = header.get("COUNT", ["1"] * len(names))
+    each = zip(("SIZE", "TYPE", "COUNT"), "4F1", strict=True)  # defaults of old files, as in PCL
+    sizes, kinds, counts = (header.get(entry, [default] * len(names)) for entry, default in each)
     fields = [
         _Field(name, np.dtype(f"<{_KINDS[kind.upper()]}{_SIZES[size]}"), int(count))
-        for name, size, kind, count in zip(names, header["SIZE"], header["TYPE"], counts, strict=True)
+        for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True)
     ]
     if any(field.count < 1 for field in fields):
         raise ValueError(f"COUNT: got {' '.join(counts)}, expected at least 1 each")
@@ -109,7 +134,26 @@ def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
 def _num_points(header: dict[str, list[str]]) -> int:
     if "POINTS" in header:
         return int(" ".join(header["POINTS"]))
-    return int(" ".join(header["WIDTH"])) * int(" ".join(header["HEIGHT"]))
+    return int(" ".join(header["WIDTH"])) * int(" ".join(header.get("HEIGHT", "1")))
+
+
+def _read_viewpoint(header: dict[str, list[str]], where: str, *, needed: bool) -> np.ndarray | None:
+    """The VIEWPOINT as a pose f64[4, 4]; None for the identity or, with a note, if it is not ``needed``."""
+    text = " ".join(header.get("VIEWPOINT", _IDENTITY))[:200]
+    try:
+        values = np.array(text.split(), np.float64)
+    except ValueError:
+        values = np.zeros(7)
+    unit = len(values) == 7 and np.isfinite(values).all() and abs(math.hypot(*values[3:]) - 1) < 1e-3
+    pose = pose_matrix(values[3:], values[:3]) if unit else None
+    if pose is not None and (pose == np.eye(4)).all():
+        return None
+    if not needed:
+        tell(f"note: {where}: its VIEWPOINT {text!r} is not applied; --viewpoint applies it", once="VIEWPOINT")
+        return None
+    if pose is None:
+        raise ValueError(f"VIEWPOINT: got {text!r}, expected x y z and a unit quaternion w x y z")
+    return pose
 
 
 def _from_ascii(body: memoryview, fields: list[_Field], number: int, places: list[int]) -> list[np.ndarray]:
@@ -118,7 +162,9 @@ def _from_ascii(body: memoryview, fields: list[_Field], number: int, places: lis
         # In parts, since words take many times the memory of their bytes.
         cut = _SPACE.search(body, first + _PART_BYTES)
         last = cut.start() if cut else len(body)
-        parts.append(np.array(bytes(body[first:last]).split(), np.float64))
+        part = bytes(body[first:last])
+        part = _NOT_A_NUMBER.sub(b"nan", part) if b"(" in part or b"#" in part else part
+        parts.append(np.array(part.split(), np.float64))
         num_values, first = num_values + len(parts[-1]), last
     if num_values != number * width:
         raise ValueError(f"DATA: got {num_values} values, expected {number} points of {width}")

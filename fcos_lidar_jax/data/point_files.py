@@ -17,9 +17,12 @@ from fcos_lidar_jax.sensors import Sensor
 
 ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # supported names, the longest first
 _RAW_COLUMNS = (3, 4, 5, 6)
+MAX_SWEEPS = 100  # default limit of the sweeps in a cloud, far more than anybody fuses
+MAX_TIME_LAG_S = 60.0  # far above any fusion; larger values, like negative ones, are timestamps or damage
 MAX_POINTS = 10_000_000  # default limit of a cloud, far above any LiDAR's
 BYTES_PER_POINT = 64  # limit of a cloud's size, as a file and unpacked
 _HEADER_BYTES = 2**20
+_UNIX_S = 1e9  # larger times, since 2001, are no ages
 _RAW_DTYPES = ("float16", "float32", "float64")
 
 # Criteria for whether a raw file is read in the layout in which it was written.
@@ -37,6 +40,8 @@ def read_points(
     columns: int | None = None,
     dtype: str | None = None,
     max_points: int = MAX_POINTS,
+    num_sweeps: int = MAX_SWEEPS,
+    viewpoint: bool = False,
 ) -> np.ndarray:
     """Read the points of a file.
 
@@ -53,6 +58,8 @@ def read_points(
         columns: values per point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
         max_points: larger clouds are refused by their header or size, before they take memory.
+        num_sweeps: largest number of different time lags; a column with more is probably something else.
+        viewpoint: transform the points by the VIEWPOINT of a ``.pcd`` file.
 
     Returns:
         f32[n, c]: x, y, z (metres, the file's frame), intensity (0-255), time lag (seconds), and the laser number
@@ -73,9 +80,11 @@ def read_points(
     path = local_path(path)
     kind = _kind(path, raw=columns is not None or dtype is not None)
     if kind.endswith(".bin"):
-        return _read_raw(path, sensor, kind, columns, dtype, max_points)
+        return _read_raw(path, sensor, kind, columns, dtype, max_points, num_sweeps)
     if columns is not None or dtype is not None:
         raise ValueError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
+    if viewpoint and kind != ".pcd":
+        raise ValueError(f"{path}: viewpoint: expected a .pcd file")
     if kind == ".feather":
         names = ("x", "y", "z", "intensity", "laser_number")
         table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)
@@ -83,22 +92,25 @@ def read_points(
     content = _read_whole(path, max_points)
     if kind == ".pcd":
         try:
-            table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_PER_POINT)
+            limits = {"max_points": max_points, "max_bytes": max_points * BYTES_PER_POINT}
+            table = parse_pcd(content, str(path), **limits, viewpoint=viewpoint)
         except ValueError as error:
             raise ValueError(f"{path}: not a readable .pcd file: {error}") from None
-        return assemble_points(path, sensor, table)
-    return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
+        return assemble_points(path, sensor, table, num_sweeps)
+    return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path), num_sweeps)
 
 
-def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -> np.ndarray:
+def points_from_array(
+    array: ArrayLike, sensor: Sensor, where: str = "points", num_sweeps: int = MAX_SWEEPS
+) -> np.ndarray:
     """Convert an array, which ``where`` names in messages, to the columns that :func:`read_points` returns.
 
     Args:
         array: [n, 3 to 6], of NumPy or JAX, or a list: x, y, z, intensity, time lag, laser number.
-        sensor: as in :func:`read_points`.
+        sensor, num_sweeps: as in :func:`read_points`.
 
     Raises:
-        ValueError: wrong shape or type, or a fifth column of whole numbers above 1, which is a ring.
+        ValueError: wrong shape or type, or a fifth column of something else, see :func:`check_time_lags`.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> points_from_array(np.array([[8, 1, -1]]), TINY).tolist()
@@ -114,19 +126,40 @@ def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -
         raise ValueError(f"{where}: dtype: got {array.dtype}, expected real numbers")
     fits = array.ndim == 2 and array.shape[1] in _RAW_COLUMNS
     check(fits, f"{where}: shape", array.shape, "N x 3, 4, 5 or 6")
-    check_time_lags(array, where)
     names = ("x", "y", "z", "intensity", "time_lag", "laser")
-    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
+    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)), num_sweeps)
 
 
-def check_time_lags(points: np.ndarray, where: str = "points") -> None:
-    """Refuse points [n, c] with whole numbers above 1 in the fifth column: rings instead of time lags."""
-    lag = points[:, 4:5]
+def check_time_lags(lag: np.ndarray, where: Path | str = "points", num_sweeps: int = MAX_SWEEPS) -> None:
+    """Refuse a column that is no time lag: Unix times, a ring, or more different values than sweeps.
+
+    >>> check_time_lags(np.linspace(0, 1.5, 820), "a.bin")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ValueError: a.bin: fifth column: got 820 different values up to 1.5, expected the time lag in seconds, one ...
+    """
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
-    if len(lag) and lag.max() > 1 and not (lag % 1).any():
+    if not lag.size:
+        return
+    most, expected = float(lag.max()), "expected the time lag in seconds: leave the column out"
+    if most >= _UNIX_S and np.median(lag) >= _UNIX_S:  # a few may be damage
         raise ValueError(
-            f"{where}: fifth column: got whole numbers up to {lag.max():g}, which look like a ring, expected the "
-            "time lag in seconds: leave the column out, or put 0 into it and the ring into a sixth"
+            f"{where}: fifth column: got values up to {most:g}, which look like Unix time, {expected}"
+        )
+    if most > 1 and not (lag % 1).any():
+        found = f"got whole numbers up to {most:g}, which look like a ring"
+        raise ValueError(f"{where}: fifth column: {found}, {expected}, or put 0 into it and the ring into a sixth")
+    check_num_lags(lag, where, num_sweeps)
+
+
+def check_num_lags(lag: np.ndarray, where: Path | str = "points", num_sweeps: int = MAX_SWEEPS) -> None:
+    """Refuse more different time lags than sweeps: times within a turn, or something else."""
+    lag = lag[(lag >= 0) & (lag <= MAX_TIME_LAG_S)]  # other rows are dropped later
+    number = len(np.unique(np.append(lag[:1], lag[1:][lag[1:] != lag[:-1]])))  # fast for sweeps in blocks
+    if number > num_sweeps:
+        raise ValueError(
+            f"{where}: fifth column: got {number} different values up to {lag.max():g}, expected the time lag in "
+            f"seconds, one per sweep, at most {num_sweeps} (num_sweeps): leave out older sweeps, or a column of "
+            'something else: --columns cannot skip it, but np.save("cloud.npy", points[:, :4]) does'
         )
 
 
@@ -210,7 +243,7 @@ def _kind(path: Path, *, raw: bool) -> str:
 
 
 def _read_raw(
-    path: Path, sensor: Sensor, kind: str, columns: int | None, dtype: str | None, max_points: int
+    path: Path, sensor: Sensor, kind: str, columns: int | None, dtype: str | None, max_points: int, num_sweeps: int
 ) -> np.ndarray:
     columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
     check(columns in _RAW_COLUMNS, f"{path}: columns", columns, "3, 4, 5 or 6")
@@ -225,7 +258,7 @@ def _read_raw(
     if _plausible_share(rows[: _INSPECTED_VALUES // columns]) < _MIN_PLAUSIBLE:
         raise ValueError(f"{path}: read with {layout}, most rows are not plausible metres; {other}")
     if kind != ".pcd.bin":
-        return points_from_array(rows, sensor, str(path))
+        return points_from_array(rows, sensor, str(path), num_sweeps)
     sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # the format's intensities are already 0-255
     return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
@@ -260,11 +293,15 @@ def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.nd
         raise ValueError(f"{path}: not a readable {kind} file: {error}") from None
 
 
-def assemble_points(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
+def assemble_points(
+    where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray], num_sweeps: int = MAX_SWEEPS
+) -> np.ndarray:
     """Combine the columns x, y, z, intensity, time_lag and laser to the array that :func:`read_points` returns.
 
-    Refuses negative lags, and missing or invalid laser numbers.
+    Refuses what is no time lag of at most ``num_sweeps`` sweeps, and missing or invalid laser numbers.
     """
+    if "time_lag" in table:
+        check_time_lags(table["time_lag"], where, num_sweeps)
     points = np.zeros((len(table["x"]), sensor.point_columns), np.float32)
     # Values too large for float32 become infinite, and are dropped with other non-finite values.
     with np.errstate(over="ignore", invalid="ignore"):

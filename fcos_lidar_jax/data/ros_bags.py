@@ -22,6 +22,7 @@ from fcos_lidar_jax.data.frame_tree import FrameTree, printable
 from fcos_lidar_jax.data.pcd import find_columns
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, assemble_points
 from fcos_lidar_jax.data.sweeps import Sweep
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor
 
 _CLOUD = ("sensor_msgs/msg/PointCloud2",)
@@ -78,12 +79,16 @@ def ros_bag_drive(
         pose_at, notes = _poses(bag, odometry, poses)
 
     def read() -> Iterator[Sweep]:
-        number, outside = 0, list[OutsidePosesError]()
+        number, outside, first = 0, list[OutsidePosesError](), None
         with _Bag(path) as bag:
             for where, cloud in bag.messages(clouds, _CLOUD):
-                number, time_us = number + 1, _time_us(cloud.header)
+                number, time_us, frame = number + 1, _time_us(cloud.header), _frame(cloud.header.frame_id)
+                first = frame if first is None else first
+                if frame != first:
+                    ids = f"frame_id {printable(frame)!r} after {printable(first)!r}"
+                    tell(f"note: {where}: {ids}: clouds of several sensors?", once="frame_id")
                 try:
-                    pose = np.eye(4) if pose_at is None else pose_at(_frame(cloud.header.frame_id), time_us, where)
+                    pose = np.eye(4) if pose_at is None else pose_at(frame, time_us, where)
                 except OutsidePosesError as error:
                     outside.append(error)
                     continue
@@ -276,7 +281,7 @@ def _parse_cloud(cloud: Any, where: str, sensor: Sensor, *, max_points: int) -> 
 def _columns_of(cloud: Any, where: str) -> list[tuple[str, np.dtype, int]]:
     """The message's columns, with type and offset within a point."""
     columns, names = [], [field.name for field in cloud.fields]
-    places = find_columns(names)
+    places = find_columns(names, where)
     if missing := [axis for axis in "xyz" if axis not in places]:
         listed = ", ".join(map(repr, names))[:500] or "none"
         raise ValueError(f"{where}: fields: got {listed}, expected one named {missing[0]}")

@@ -88,7 +88,7 @@ def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any
 
     def read(index: int, each: ListedSweep) -> Sweep:
         try:
-            points = read_points(path.parent / each.file, sensor, **layout)
+            points = read_points(path.parent / each.file, sensor, num_sweeps=1, **layout)
         except ValueError as error:
             raise ValueError(f"{path}: $[{index}].file: {error}") from None
         return Sweep(points, np.array(each.sensor_to_world), each.timestamp_us)

@@ -149,11 +149,14 @@ def align(
     notes: tuple[str, ...] = ()
     if recorded is not None and (first is None or file is not None):  # a path does not tell the number of rows
         notes = other_rows(recorded, detector)
+    aligned = Alignment(data, detector, yaw_rad)
+    if paths and recorded is None and yaw_rad is None and (axis := aligned._expected_axis):
+        notes = (f"note: the heading of the clouds is not declared (--data-sensor, --yaw-deg){axis}",)
     if first is not None and recorded is not None and data != detector:
         told = f"recorded by {recorded.name}, as its {file.name if file else 'path'} says"
         scaled = f"intensities times {data.intensity_scale:g}"
         notes += (f"{first.parent}: {told}; override with --data-sensor: {scaled}",)
-    return Alignment(data, detector, yaw_rad, notes)
+    return dataclasses.replace(aligned, notes=notes)
 
 
 def other_rows(recorded: Sensor, detector: Sensor) -> tuple[str, ...]:

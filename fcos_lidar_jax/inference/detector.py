@@ -97,7 +97,7 @@ class CloudDetector(abc.ABC):
             the boxes, best score first, at most ``config.inference.max_detections``, without padding.
 
         Raises:
-            ValueError: invalid shape or type, or a fifth column that contains rings instead of time lags.
+            ValueError: invalid shape or type, or a fifth column of something other than time lags.
         """
         is_file = isinstance(points, str | Path)
         sensor = load_sensor(sensor) if isinstance(sensor, str | Path) else sensor
@@ -107,7 +107,7 @@ class CloudDetector(abc.ABC):
         if is_file:
             rows, num_close = read_cloud(points, data, reading, full_turn=full_turn)
         else:
-            rows, num_close = drop_close(_scaled_once(points, data), data, reading)
+            rows, num_close = drop_close(_scaled_once(points, data, reading.num_sweeps), data, reading)
         aligned.tell_notes()
         request = Request(0, str(points) if is_file else "points", lambda: unlabelled(rows, num_close))
         how: dict[str, Any] = {"devices": jax.local_devices()[:1], "ahead": 0, "quiet": True}
@@ -132,9 +132,9 @@ class CloudDetector(abc.ABC):
         return jax.tree.map(lambda leaf: leaf[0], jax.device_get(found))
 
 
-def _scaled_once(points: Rows, sensor: Sensor) -> np.ndarray:
+def _scaled_once(points: Rows, sensor: Sensor, num_sweeps: int) -> np.ndarray:
     """An array in the columns of a sensor; its intensities are scaled unless they were before."""
-    rows = points_from_array(points, sensor)
+    rows = points_from_array(points, sensor, num_sweeps=num_sweeps)
     if sensor.intensity_scale == 1:
         return rows
     if np.count_nonzero(rows[:, 3] > 255) > len(rows) / 2:

@@ -108,7 +108,7 @@ def _check_frame(where: str, frame: Frame, columns: int) -> None:
     fits = frame.points.ndim == 2 and columns in (5, 6) and frame.points.shape[1] == columns
     expected = "[n, 5], or [n, 6] with laser numbers, as the other frames"
     check(fits, f"{where}: points: shape", frame.points.shape, expected)
-    check_time_lags(frame.points, f"{where}: points")
+    check_time_lags(frame.points[:, 4], f"{where}: points")
     check_boxes(frame.boxes, lambda box: f"{where}: box {box}")
     least = int(frame.labels.min(initial=0))
     check(least >= 0, f"{where}: labels", least, "indices of classes, from 0")

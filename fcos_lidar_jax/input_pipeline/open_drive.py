@@ -48,7 +48,9 @@ def _scene_drive(
     return Drive(sweeps, at_us=frozenset(tokens) if keyframes else None, tokens=tokens, notes=notes)
 
 
-FOLDER = Recording("a folder of point files", None, folder_drive, ("poses", "columns", "dtype", "max_points"))
+FOLDER = Recording(
+    "a folder of point files", None, folder_drive, ("poses", "columns", "dtype", "max_points", "viewpoint")
+)
 SCENE = Recording(
     "--data-root and --scene",
     None,

@@ -20,6 +20,7 @@ from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.data.point_files import check_num_lags
 from fcos_lidar_jax.devices.mesh import check_batch_size
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import local_path, read_json
@@ -208,6 +209,7 @@ def recorded_config(config: Config, frames: FrameSet) -> dict[str, Any]:
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
     clouds = {index: frames.frame(index).points for index in spread_indices(len(frames), 5)}
     for index, points in clouds.items():
+        check_num_lags(points[:, 4], frames.name(index), config.num_sweeps)
         if mismatch := sensor_mismatch(points, frames.sensor):
             yield f"{frames.name(index)}: {mismatch}"
             break

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.cloud_policy import MAX_TIME_LAG_S
+from fcos_lidar_jax.data.point_files import MAX_TIME_LAG_S
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes, rows_of_objects
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.sensors import Sensor

@@ -29,6 +29,7 @@ def home(tmp_path_factory):
         np.save(place, points)
     np.save(folder / "away.npy", points + np.array([500, 500, 0, 0, 0], np.float32))
     np.save(folder / "no_rows.npy", points[:0])
+    np.save(folder / "scaled_ring.npy", np.column_stack([points[:, :4], np.arange(len(points)) % 16 / 15]))
     np.zeros((9, 5), np.float32).tofile(folder / "cloud.pcd.bin")
     (folder / "link.json").symlink_to("good.npy")
     for name in ("empty.bin", "a.bag"):
@@ -53,6 +54,13 @@ detect HOME/empty.bin => empty.bin: empty file
 detect HOME/away.npy => away.npy: none of its .* points is usable
 detect HOME/away.npy HOME/no_rows.npy => away.npy: none of its .* points is usable
 detect HOME/training => training: no point file in it, expected [^;]*$
+detect HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* 1 \(num_sweeps\): .*--columns
+project HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* at most 10 \(num_sweeps\)
+stream HOME/scaled_ring.npy --checkpoint HOME/checkpoint => scaled_ring.npy: fifth column: got 16 .* at most 1
+benchmark HOME/scaled_ring.npy --checkpoint HOME/checkpoint => scaled_ring.npy: fifth column: got 16 .* at most 1
+detect HOME/good.npy --viewpoint => good.npy: viewpoint: expected a .pcd file
+project HOME/good.npy --viewpoint => good.npy: viewpoint: expected a .pcd file
+stream HOME/good.npy --viewpoint --checkpoint HOME/checkpoint => good.npy: viewpoint: expected a .pcd file
 detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
 detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, quickstart$
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps

@@ -9,7 +9,7 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.drives import folder_drive, read_tum
+from fcos_lidar_jax.data.drives import Drive, folder_drive, read_tum
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.input_pipeline.open_drive import SCENE
@@ -49,6 +49,38 @@ def test_clouds_named_by_times_are_in_temporal_order(poses):
     unposed = folder_drive(poses / "clouds", TINY).sweeps
     assert [sweep.name.rpartition("/")[2] for sweep in unposed] == names
     np.testing.assert_allclose([sweep.sensor_to_world[0, 3] for sweep in sweeps], [0, 1, 2, 3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "places_m", "told"),
+    [
+        ((9, 9, 9, 9), (0, 3, 6, 9), ""),
+        ((9, 0, 20, 9), (0, 3, 6, 9), ""),  # empty clouds are told elsewhere
+        (
+            (9, 9, 30, 9),
+            (0, 3, 6, 9),
+            "note: 2: it has 30 points, after 9 of 1: clouds of several sensors or drives?\n",
+        ),
+        (
+            (9, 2, 9, 2),
+            (0, 3, 6, 9),
+            "note: 1: it has 2 points, after 9 of 0: clouds of several sensors or drives?\n",
+        ),
+        (
+            (9, 9, 9, 9),
+            (0, 40, 0, 40),
+            "note: 1: its pose is 40.0 m away, 0.1 s after 0: clouds of several sensors or drives?\n",
+        ),
+    ],
+)
+def test_clouds_that_jump_are_told_once(capsys, numbers, places_m, told):
+    sweeps = []
+    for i, (number, x) in enumerate(zip(numbers, places_m, strict=True)):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        sweeps.append(Sweep(np.repeat(CLOUD, number, axis=0), pose, i * 100_000, str(i)))
+    assert list(Drive(sweeps).sweeps) == sweeps
+    assert capsys.readouterr().err == told
 
 
 def test_clouds_with_other_names_need_one_pose_each(poses):

@@ -13,7 +13,7 @@ from refusal import refused
 
 from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.data import point_files
-from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -204,6 +204,103 @@ def test_four_and_five_columns_are_distinguished_by_their_values(tmp_path, point
     assert read_points(four, NUSCENES_HDL32E, columns=4).shape == (number, 5)
     with refused("5 float32 values per point, most rows are not plausible metres", four):
         read_points(four, NUSCENES_HDL32E)
+
+
+def one_of(values):
+    return f"got {len(np.unique(values))} different values up to {values.max():g}, expected the time lag"
+
+
+NO_LAGS = {
+    "elongation": (elongation := np.linspace(0, 1.5, 820, dtype=np.float32), one_of(elongation)),
+    "times within a turn": (times := np.arange(820, dtype=np.float32) / 8200, one_of(times)),
+    "scaled ring": (scaled := (np.arange(820) % 16 / np.float32(15)), one_of(scaled)),
+    "ring": (np.arange(820) % 16, "got whole numbers up to 15, which look like a ring"),
+    "Unix seconds": (1.5e9 + np.arange(820) / 8192, "got values up to 1.5e+09, which look like Unix time"),
+    "Unix nanoseconds": (1.5e18 + np.arange(820), "got values up to 1.5e+18, which look like Unix time"),
+}
+FORMS = ("five.bin", "six.bin", "a.npy", "a.npz", "a.pcd", "array")
+
+
+@pytest.mark.parametrize("kind", NO_LAGS)
+@pytest.mark.parametrize("form", FORMS)
+def test_a_fifth_column_of_something_else_is_refused(tmp_path, points, form, kind):
+    values, message = NO_LAGS[kind]
+    rows = np.column_stack([points[:820, :4], values, np.zeros(820)])[:, : 6 if form == "six.bin" else 5]
+    rows = rows.astype(np.float32 if form.endswith(("bin", "pcd")) else np.float64)
+    if form == "array":
+        with refused(f"points: fifth column: {message}"):
+            points_from_array(rows, NUSCENES_HDL32E, num_sweeps=10)
+        return
+    fives = {
+        "fields": "x y z intensity time_lag",
+        "kinds": "F F F F F",
+        "sizes": "4 4 4 4 4",
+        "counts": "1 1 1 1 1",
+    }
+    pcd = pcd_header("binary", 820, **fives) + rows.tobytes()
+    path = save(tmp_path / form, pcd if form == "a.pcd" else rows)
+    with refused(f"fifth column: {message}", path):
+        columns = rows.shape[1] if form.endswith(".bin") else None
+        read_points(path, NUSCENES_HDL32E, columns=columns, num_sweeps=10)
+
+
+def test_as_many_time_lags_as_sweeps_are_read(points):
+    lags = np.float32(np.arange(10) * 0.05)
+    for rows in (np.resize(lags, 2000), np.repeat(lags, 200)):
+        rows = np.column_stack([points[:, :4], rows])
+        np.testing.assert_array_equal(points_from_array(rows, NUSCENES_HDL32E, num_sweeps=10), rows)
+        with refused("points: fifth column: got 10 different values up to 0.45, expected"):
+            points_from_array(rows, NUSCENES_HDL32E, num_sweeps=9)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_viewpoint_of_a_pcd_file_is_told_or_applied(tmp_path, capsys, turned):
+    """A quarter of a turn about z, then a metre along x."""
+    words = "1 0 0 0.7071068 0 0 0.7071068" if turned else "0 0 0 -1 0 0 0"
+    header = pcd_header("ascii", 1).replace(b"VIEWPOINT 0 0 0 1 0 0 0", f"VIEWPOINT {words}".encode())
+    path = save(tmp_path / "a.pcd", header + b"5 2 -1 9\n")
+    for _ in range(2):
+        assert read_points(path, NUSCENES_HDL32E).tolist() == [[5, 2, -1, 9, 0]]
+    told = f"note: {path}: its VIEWPOINT {words!r} is not applied; --viewpoint applies it\n"
+    assert capsys.readouterr().err == (told if turned else "")
+    moved = read_points(path, NUSCENES_HDL32E, viewpoint=True)
+    np.testing.assert_allclose(moved, [[-1, 5, -1, 9, 0] if turned else [5, 2, -1, 9, 0]], atol=1e-6)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_viewpoint_that_cannot_be_applied_is_refused(tmp_path):
+    header = pcd_header("ascii", 1)
+    for words in ("0 0 0 0 0 0 0", "0 0 0 1", "a b c d e f g", "-nan(ind) 0 0 1 0 0 0"):
+        path = save(tmp_path / "a.pcd", header.replace(b" 0 0 0 1 0 0 0", f" {words}".encode()) + b"5 2 -1 9\n")
+        assert read_points(path, NUSCENES_HDL32E)[0, 0] == 5
+        with refused(f"damaged header: VIEWPOINT: got {words!r}, expected", path):
+            read_points(path, NUSCENES_HDL32E, viewpoint=True)
+    with refused("viewpoint: expected a .pcd file"):
+        read_points(save(tmp_path / "a.bin", np.zeros((4, 4), np.float32)), NUSCENES_HDL32E, viewpoint=True)
+
+
+@pytest.mark.parametrize(
+    ("field", "told"),
+    [
+        *((name, False) for name in ("intensity", "i", "Intensities", "remission", "Scalar_Intensity")),
+        *((name, True) for name in ("signal", "reflectance", "intensity_2")),
+    ],
+)
+def test_fields_like_an_intensity_are_read_or_told(tmp_path, capsys, field, told):
+    path = save(tmp_path / "a.pcd", pcd_header("ascii", 1, f"x y z {field}") + b"5 2 -1 9\n")
+    assert read_points(path, NUSCENES_HDL32E)[0, 3] == (0 if told else 9)
+    assert (f"note: {path}: field {field.lower()!r} is not read: rename" in capsys.readouterr().err) == told
+
+
+def test_old_pcd_headers_and_the_numbers_of_other_libraries_are_read(tmp_path):
+    rows = b"5 2 -1 9\n-nan(ind) 1.#QNAN -1.#IND00 1.#INF\nnan(snan) nan 2 3\n"
+    for header in (b"COLUMNS x y z intensity\nPOINTS 3\nDATA ascii\n", pcd_header("ascii", 3)):
+        read = read_points(save(tmp_path / "a.pcd", header + rows), NUSCENES_HDL32E)
+        assert read[0].tolist() == [5, 2, -1, 9, 0]
+        assert np.isnan(read[1:, 0]).all()
+        assert np.isnan(read[1]).sum() == 4
+    old = b"# .PCD v.5\nVERSION .5\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nDATA ascii\n5 2 -1\n"
+    assert read_points(save(tmp_path / "a.pcd", old), NUSCENES_HDL32E).tolist() == [[5, 2, -1, 0, 0]]
 
 
 def test_millimetres_are_refused(tmp_path, points):

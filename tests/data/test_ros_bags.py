@@ -144,6 +144,17 @@ def turn(yaw):
     return Rotation.from_euler("z", yaw).as_quat()
 
 
+def test_clouds_of_several_sensors_on_one_topic_are_told_once(tmp_path, capsys):
+    def clouds(make):
+        for number in range(6):
+            yield "/points", make.cloud(START_NS + number * 10**8, POINTS, ("lidar", "/lidar", "rear")[number % 3])
+
+    bag = write_recording(tmp_path / "a", "mcap", clouds)
+    assert len(list(ros_bag_drive(bag, TINY).sweeps)) == 6
+    told = f"note: {bag}: /points: message 2: frame_id 'rear' after 'lidar': clouds of several sensors?\n"
+    assert capsys.readouterr().err == told
+
+
 def matrix(place, quaternion):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), place

@@ -46,6 +46,7 @@ def test_static_points_coincide_in_listed_sweeps(tmp_path):
 
 def test_sweeps_can_be_raw_files_of_another_layout(tmp_path):
     rows = np.random.default_rng(0).uniform(3, 9, (40, 6))
+    rows[:, 4] = 0.25
     rows.tofile(tmp_path / "a.bin")
     (tmp_path / "sweeps.json").write_text(json.dumps([entry("a.bin")]))
     options = {"columns": 6, "dtype": "float64"}

@@ -1,6 +1,7 @@
 """Clouds of other axes: rotated and shifted for the detector, and boxes transformed back."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -65,6 +66,21 @@ def test_files_of_several_sensors_and_wrong_scales_are_refused(tmp_path):
         align(NUSCENES_HDL32E, paths=[kitti, other])
     with refused("intensity_scale: got -1.0, expected within (0, 1e+30]"):
         align(NUSCENES_HDL32E, intensity_scale=-1.0)
+
+
+def test_a_note_says_if_nothing_declares_the_heading_of_files(capsys):
+    options = "(--data-sensor, --yaw-deg)"
+    told = f"note: the heading of the clouds is not declared {options}: the detector expects y ahead\n"
+    files = [Path("a.npy")]
+    for aligned, expected in (
+        (align(TINY, paths=files), told),
+        (align(TINY, TINY, paths=files), ""),
+        (align(TINY, paths=files, yaw_rad=0.0), ""),
+        (align(VLP16, paths=files), ""),
+        (align(NUSCENES_HDL32E, paths=[Path("LIDAR_TOP/a.pcd.bin")]), ""),
+    ):
+        aligned.tell_notes()
+        assert capsys.readouterr().err == expected
 
 
 def test_a_note_says_if_only_one_heading_is_known(capsys):

@@ -14,6 +14,7 @@ import optax
 import oracles
 import pytest
 import tiny_peer
+from refusal import refused
 from tiny_run import TINY_CONFIG, TINY_REFINED, weights
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -364,6 +365,9 @@ def test_a_warning_names_a_frame_that_does_not_fit_the_sensor():
     made = InMemoryFrames(tuple(frames), TINY, NUSCENES_CLASSES)
     [warning] = plan._warnings(made, CONFIG)
     assert warning.startswith(f"{made.name(1)}: points do not fit")
+    frames[0].points[:, 4] = np.arange(len(frames[0].points)) % 16 / 15
+    with refused("fifth column: got 16 different values up to 1, expected the time lag", made.name(0)):
+        list(plan._warnings(made, CONFIG))
 
 
 @pytest.mark.slow
