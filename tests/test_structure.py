@@ -28,7 +28,7 @@ def test_only_the_rows_of_the_readers_know_formats_by_name():
     compared = {
         file
         for file, node in nodes("fcos_lidar_jax")
-        if isinstance(node, ast.Compare)
+        if isinstance(node, ast.Compare) and "output_format" not in ast.unparse(node)  # formats of results
         for part in ast.walk(node)
         if isinstance(part, ast.Constant) and part.value in names
     }
