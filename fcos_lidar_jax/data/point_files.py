@@ -79,12 +79,12 @@ def read_points(
     """
     path = local_path(path)
     kind = _kind(path, raw=columns is not None or dtype is not None)
+    if viewpoint and kind != ".pcd":
+        raise ValueError(f"{path}: viewpoint: expected a .pcd file")
     if kind.endswith(".bin"):
         return _read_raw(path, sensor, kind, columns, dtype, max_points, num_sweeps)
     if columns is not None or dtype is not None:
         raise ValueError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
-    if viewpoint and kind != ".pcd":
-        raise ValueError(f"{path}: viewpoint: expected a .pcd file")
     if kind == ".feather":
         names = ("x", "y", "z", "intensity", "laser_number")
         table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)

@@ -114,7 +114,8 @@ def check_points(points: np.ndarray, sensor: Sensor) -> None:
     shape = (len(points), sensor.point_columns)
     expect(points.dtype == np.float32 and points.shape == shape, f"{points.dtype} {points.shape}")
     kept, num_close = drop_close(points, sensor, CONFIG.reading)
-    cloud = make_cloud(kept, CONFIG, sensor=sensor, num_close=num_close)
+    config = dataclasses.replace(CONFIG, num_sweeps=100)
+    cloud = make_cloud(kept, config, sensor=sensor, num_close=num_close)
     expect(np.isfinite(cloud.points[cloud.valid]).all(), "points that are not finite")
     expect(cloud.valid.sum() + cloud.num_removed == len(points), "points that are not counted")
 
