@@ -13,6 +13,7 @@ RECORDED_BY = {
     "velodyne_points/data/*.bin": KITTI_HDL64E,
     "sensors/lidar/*.feather": ARGOVERSE2,
     "LIDAR_TOP/*.pcd.bin": NUSCENES_HDL32E,
+    "*__LIDAR_TOP__*.pcd.bin": NUSCENES_HDL32E,
 }
 """Ends of paths -> the sensor whose heading, position and intensity scale the files have."""
 

@@ -78,6 +78,7 @@ def test_a_note_says_if_nothing_declares_the_heading_of_files(capsys):
         (align(TINY, paths=files, yaw_rad=0.0), ""),
         (align(VLP16, paths=files), ""),
         (align(NUSCENES_HDL32E, paths=[Path("LIDAR_TOP/a.pcd.bin")]), ""),
+        (align(NUSCENES_HDL32E, paths=[Path("n015__LIDAR_TOP__7.pcd.bin")]), ""),
     ):
         aligned.tell_notes()
         assert capsys.readouterr().err == expected
