@@ -47,7 +47,7 @@ def predict(
         notes: lines to print once the first frame was read, once per process.
 
     Raises:
-        ValueError: a batch size below 1, or a frame that cannot be read.
+        ValueError: a batch size below 1, or frames that cannot be read; missing files, before the first is.
 
     >>> from fcos_lidar_jax.inference import load_detector
     >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
@@ -59,6 +59,7 @@ def predict(
     check_frames(frames)
     aligned = Alignment(frames.sensor, detector.sensor, yaw_rad, notes)
     todo = range(len(frames)) if indices is None else indices
+    frames.check_files(todo)
     requests = (Request(index, frames.name(index), functools.partial(frames.frame, index)) for index in todo)
     how: dict[str, Any] = {"batch_size": batch_size, "devices": devices}
     return detect_clouds(detector.program, detector.config, aligned, requests, **how)

@@ -44,6 +44,15 @@ def test_more_time_lags_than_the_detector_has_sweeps_are_refused(detector):
             detect()
 
 
+def test_missing_files_are_refused_before_a_frame_is_read(detector, monkeypatch):
+    def missing(_, indices):
+        raise ValueError(f"clouds {[*indices]}: missing")
+
+    monkeypatch.setattr(type(TESTS), "check_files", missing)
+    with refused("clouds [1]: missing"):
+        predict(detector, TESTS, indices=[1])
+
+
 class OnlyTruth(WrappedFrames):
     """Test frames whose clouds are on another machine."""
 
