@@ -194,6 +194,12 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
     assert png.stat().st_size > 10_000
 
 
+def test_project_warns_of_another_sensor(home, tmp_path, capsys):
+    for sensor, warned in (("tiny", False), ("nuscenes_hdl32e", True)):
+        command("project", home / "good.npy", "--out", tmp_path / "image.npz", "--sensor", sensor)
+        assert ("warning: " in capsys.readouterr().err) == warned
+
+
 @pytest.mark.parametrize("line", ["detct", "detect --checkpiont x", "project", "demo --drive many"])
 def test_usage_errors_exit_with_2(line):
     with pytest.raises(SystemExit) as stopped:
