@@ -25,6 +25,7 @@ _LESS_MEMORY = (
 _PLATFORMS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
 _STRICT = ("JAX_TRANSFER_GUARD", "JAX_NO_EXECUTION", "JAX_DEBUG_", "JAX_CHECK_", "JAX_DISALLOW_", "JAX_NUMPY_")
 """Beginnings of the variables by which JAX refuses, for debugging, what is usual."""
+_OFF = ("", "0", "false", "off", "allow")
 _MAX_LINE = 1000
 _CLOSED_CONNECTION = "closed by peer|reset by peer|Broken pipe|Read error|Write error"
 _CLOSED_PIPE = 128 + signal.SIGPIPE
@@ -124,7 +125,8 @@ def _explain(error: Exception) -> str | None:
             return f"another process ended, see its output: {text}"
         return f"the connection between the processes failed: {text}"
     is_expected = isinstance(error, ValueError | OSError | ArithmeticError)
-    strict = [f"{name}={value}" for name, value in os.environ.items() if name.startswith(_STRICT)]
+    given = [(name, value) for name, value in os.environ.items() if name.startswith(_STRICT)]
+    strict = [f"{name}={value}" for name, value in given if value.lower() not in _OFF]
     if strict and (isinstance(error, FloatingPointError) or not is_expected):
         return f"the environment has {', '.join(strict)}, which makes JAX refuse more than usual: {text}"
     if is_expected:

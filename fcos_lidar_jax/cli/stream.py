@@ -142,7 +142,7 @@ def run(args: Stream) -> None:
 
 
 def _in_order(drive: Drive, timing: "_Timing") -> Iterator[Sweep]:
-    """The sweeps, with poses only those that are later than all before; in the end, a note counts the others."""
+    """Yield the sweeps; with poses, only sweeps that are later than all earlier ones. A note counts the others."""
     latest_us, others = -math.inf, list[str]()
     timing.begin("reading")
     for sweep in drive.sweeps:

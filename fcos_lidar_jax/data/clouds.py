@@ -62,7 +62,7 @@ class CloudFiles(FrameSet):
         return [file] if calibration is None else [file, calibration]
 
     def fingerprint(self) -> str:
-        """Of how files are read; :meth:`clouds_fingerprint` is of the files."""
+        """Checksum of the options of reading; :meth:`clouds_fingerprint` is the checksum of the files' states."""
         reading = self.sensor, self.reading, self.columns, self.dtype, self.full_turn, self.viewpoint
         return checksum(repr(reading).encode())
 

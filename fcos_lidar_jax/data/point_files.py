@@ -159,7 +159,7 @@ def check_num_lags(lag: np.ndarray, where: Path | str = "points", num_sweeps: in
         raise ValueError(
             f"{where}: fifth column: got {number} different values up to {lag.max():g}, expected the time lag in "
             f"seconds, one per sweep, at most {num_sweeps} (num_sweeps): leave out older sweeps, or a column of "
-            'something else: --columns cannot skip it, but np.save("cloud.npy", points[:, :4]) does'
+            "something else, as in points[:, :4]; --columns cannot skip it"
         )
 
 

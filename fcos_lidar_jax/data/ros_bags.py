@@ -44,10 +44,14 @@ def is_ros_bag(path: Path) -> bool:
 
 def _files(path: Path) -> list[Path]:
     """What rosbags can open: the path, or the files of a folder whose metadata lack the format or are missing."""
-    files, metadata = sorted(path.iterdir()) if path.is_dir() else [], path / "metadata.yaml"
-    text = metadata.read_text(encoding="utf-8", errors="replace") if metadata in files else "relative_file_paths"
-    whole = "relative_file_paths" not in text or re.search(r"storage_identifier:\s*[\"']?\w", text)
-    if whole or any(file.name.endswith(ENDINGS) for file in files):
+    if not path.is_dir():
+        return [path]
+    files, metadata = sorted(path.iterdir()), path / "metadata.yaml"
+    if metadata in files:
+        text = metadata.read_text(encoding="utf-8", errors="replace")
+        if "relative_file_paths" not in text or re.search(r"storage_identifier:\s*[\"']?\w", text):
+            return [path]
+    if any(file.name.endswith(ENDINGS) for file in files):
         return [path]
     return [file for file in files if file.suffix in _ENDINGS] or [path]
 

@@ -63,6 +63,7 @@ def write_predictions(
     with contextlib.ExitStack() as held:
         with agreed("cannot detect"):
             same, names = (how.get("batch_size", 1), how.get("yaw_rad")), [*map(frames.name, range(len(frames)))]
+            frames.check_files(range(len(names)))
             if jax.process_index() == 0:
                 log = held.enter_context(_open_log(path, _fingerprint(detector, frames, *same, options)))
                 finished = _Finished(log, frames, names, unit)

@@ -193,11 +193,13 @@ def prepare_database(
             shard.
 
     Raises:
-        ValueError: a frame has other columns than its sensor, or an implausible box; no frame has usable points.
+        ValueError: missing files, before a frame is read; a frame has other columns than its sensor, or an
+            implausible box; no frame has usable points.
         OSError: an error of the file system, or a worker died.
     """
     folder = Path(folder)
     check(workers >= 1, "workers", workers, "at least 1")
+    frames.check_files(range(len(frames)))
     shards, source, columns = shards_by_scene(frames), frames.fingerprint(), frames.sensor.point_columns
     folder.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(folder, shards)

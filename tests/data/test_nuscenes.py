@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from fcos_lidar_jax.data.nuscenes.build import build_index, velocities
 from fcos_lidar_jax.data.nuscenes.index import default_index, open_index, save_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.data.nuscenes.tables import SampleData, read_table
+from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline.database import prepare_database
 from fcos_lidar_jax.input_pipeline.open import open_frames
 
@@ -182,9 +185,14 @@ def test_partial_downloads_are_counted_before_the_first_frame(tmp_path, monkeypa
         return
     with pytest.raises(ValueError, match=".*".join(fragments)):
         MappedFrames(frames, NUSCENES_CLASSES).check_files(range(8))
-    for use in (frames.clouds_fingerprint, lambda indices: prepare_database(frames, tmp_path / "objects")):
-        with pytest.raises(ValueError, match="are missing"):
-            use(range(8))
+    detector, unused = Mock(spec=TrainedDetector), {"entries": pytest.fail, "write": pytest.fail}
+    for use in (
+        lambda: write_predictions(detector, frames, tmp_path / "results", **unused),
+        lambda: prepare_database(frames, tmp_path / "objects"),
+    ):
+        with pytest.raises(ValueError, match=".*".join(fragments)):
+            use()
+    assert not (tmp_path / "objects").exists()
 
 
 def rewrite(table: str, edit: Callable[[str], str]):

@@ -86,6 +86,19 @@ def test_first_hits_match_ray_marching(seed, ground):
     assert met > 30
 
 
+def test_rays_hit_every_kind_and_the_nearest_solid():
+    solids = make_solids(BOX, [[6 + 4 * k, 0, 0] for k in range(4)], [1, 1, 1])
+    solids["kind"] = BOX, DRUM, BALL, WHEEL
+    straight = Fan(np.array([0.0]), 1, 0.0, 1e-3, np.zeros(1))
+    rng = np.random.default_rng(0)
+    for first in range(4):
+        hits = cast(straight, np.eye(3), np.zeros(3), solids[first:], FAR_BELOW, rng)
+        assert (hits.solid[0], hits.range_m[0]) == (0, pytest.approx(5 + 4 * first))
+        assert hits.cosine[0] == pytest.approx(1)
+    backwards = cast(straight, np.eye(3), np.zeros(3), solids[::-1], FAR_BELOW, rng)
+    assert backwards.solid[0] == 3
+
+
 @pytest.mark.parametrize("kind", [BOX, DRUM, BALL, WHEEL])
 def test_incidence_matches_the_gradient_of_the_level_function(kind):
     rng = np.random.default_rng(kind)
@@ -119,3 +132,15 @@ def test_porous_solids_stop_rays_according_to_depth():
     assert stopped.mean() == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 4000))
     assert hits.range_m[stopped].min() >= 8 - 1e-3
     assert hits.range_m[stopped].max() <= 12 + 1e-3
+
+
+def test_reachable_includes_occluded_rays():
+    """A post in front of a wall stops rays that would reach the wall."""
+    solids = make_solids(BOX, [[20, 0, 0], [10, 1, 0]], [[0.1, 4, 4], [0.1, 1, 4]], owner=np.array([0, 1]))
+    fan = Fan(np.zeros(1), 400, 0.35, 0.7 / 400, np.zeros(1))
+    hits = cast(fan, np.eye(3), np.zeros(3), solids, FAR_BELOW, np.random.default_rng(0))
+    owners, seen = np.bincount(hits.reachable // 400, minlength=2), (hits.solid == 0).sum()
+    # Numbers of rays. The post hides the wall from straight ahead to its outer edge.
+    wide, behind = 2 * np.arctan2(4, 19.9) / (0.7 / 400), np.arctan2(2, 9.9) / (0.7 / 400)
+    np.testing.assert_allclose(owners, [wide, behind], atol=1.01)
+    assert seen == pytest.approx(wide - behind, abs=1.51)

@@ -102,6 +102,28 @@ def test_fused_frames_are_reproducible_and_annotated_by_the_current_sweep(fast_f
     assert set(np.unique(laser.points[:, 5])) <= set(range(64))
 
 
+def test_old_points_of_moving_objects_trail_by_velocity_times_lag(fast_frames):
+    """A moving box shifted back by velocity x lag contains more points than with a lag of 0.05 s more or less.
+
+    A static box contains more points than when it is shifted by half a metre.
+    """
+    trails, stays = np.zeros((10, 3), int), np.zeros((10, 3), int)
+    around = np.array([-1.0, 0, 1])
+    for frame in fast_frames:
+        for box in frame.boxes.astype(np.float64):
+            speed = np.hypot(box[7], box[8])
+            if 0 < speed < 6:
+                continue
+            for k, lag in enumerate(LAGS):
+                points = frame.points[frame.points[:, 4] == lag]
+                moves = -(lag + 0.05 * around)[:, None] * box[7:] if speed else around[:, None] * [0, 0.5]
+                moved = box + np.pad(moves, ((0, 0), (0, 7)))
+                (trails if speed else stays)[k] += count_inside(points, moved)
+    for counts in (trails, stays):
+        assert counts.min() > 500
+        np.testing.assert_array_equal(counts.argmax(axis=1), np.ones(10))
+
+
 def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep(fast_frames):
     frames = SimulatedFrames(SHORT_RANGE, 3, 5, reading=CloudReading(10), fast_traffic=True)
     passed = 0

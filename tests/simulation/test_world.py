@@ -262,6 +262,17 @@ def test_the_seen_share_is_the_share_of_unblocked_rays():
     assert [visibility_of(s) for s in share] == ["2", "4", "4"]
 
 
+def test_intensity_follows_material_and_angle():
+    means = {}
+    for name, albedo, yaw in (("bright", 0.5, 0.0), ("dark", 0.1, 0.0), ("oblique", 0.5, 1.2)):
+        plate = make_solids(BOX, [12, 0, 2], [0.05, 1, 3], albedo=albedo, yaw=yaw)
+        sweep = scan_fine(made_by_hand(make_motion(), scenery=plate))
+        local = sweep.points[sweep.returned]
+        means[name] = local[(local[:, 2] > -1) & (np.linalg.norm(local[:, :3], axis=1) > 5), 3].mean()
+    assert means["bright"] / means["dark"] == pytest.approx(5, rel=0.15)
+    assert means["oblique"] < 0.85 * means["bright"]
+
+
 def test_points_without_return_surround_the_sensor_and_points_have_laser_numbers():
     mount = sample_mount(default_rng(0), TINY, level=True)
     sweep = scan(made_by_hand(make_motion()), TINY, mount, 0.0, default_rng(0))

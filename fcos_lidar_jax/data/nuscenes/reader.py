@@ -352,8 +352,7 @@ class NuScenesFrames(FrameSet):
         self.nuscenes.check_files([self.tokens[index] for index in indices], self.reading.num_sweeps)
 
     def clouds_fingerprint(self, indices: Iterable[int]) -> str:
-        tokens, number = [self.tokens[index] for index in indices], self.reading.num_sweeps
-        self.nuscenes.check_files(tokens, number)
+        tokens, number = (self.tokens[index] for index in indices), self.reading.num_sweeps
         files = {file for token in tokens for file in self.nuscenes.sweep_files(token, number)}
         return files_fingerprint(files, self.nuscenes.root, None)
 
