@@ -180,8 +180,8 @@ def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
 def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     """Read a JSON file in UTF-8 and check its content against a type that msgspec can check.
 
-    NaN and infinities are accepted; callers reject them by name. ``what`` describes the file in the message that
-    it is missing.
+    A byte order mark, as Windows editors write it, is skipped. NaN and infinities are accepted; callers reject
+    them by name. ``what`` describes the file in the message that it is missing.
 
     Raises:
         ValueError: one line with the file and, on a type mismatch, the place, the found and the expected value.
@@ -196,7 +196,7 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     if not local_path(path).is_file():
         raise ValueError(f"{path}: no such file, expected {what}")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

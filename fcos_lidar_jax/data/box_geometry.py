@@ -6,8 +6,8 @@ import numpy as np
 
 from fcos_lidar_jax.geometry import points_in_box
 
-LIMITS = dict.fromkeys("xyz", 10_000.0) | dict.fromkeys("lwh", 500.0) | {"yaw": 1000.0, "vx": 500.0, "vy": 500.0}
-"""Field of a box -> largest plausible magnitude: metres, radians, metres per second."""
+LIMITS = dict.fromkeys("xyz", 1e4) | dict.fromkeys("lwh", 500.0) | {"yaw": 4 * np.pi, "vx": 500.0, "vy": 500.0}
+"""Field of a box -> largest plausible magnitude: metres, radians (larger yaws are degrees), metres per second."""
 _CELL_M = 0.5
 _MAX_CELLS = 1024  # per side: a box far away makes the cells larger instead of the grid
 _SLACK_M = 1e-3  # far above float32 rounding, so that the coarse tests never lose an inside point
@@ -29,7 +29,8 @@ def check_boxes(boxes: np.ndarray, place: Callable[[int], str]) -> None:
         return
     row, column = np.argwhere(~good)[0]
     name = list(LIMITS)[column]
-    expected = f"at most {LIMITS[name]:g}" if positive[row, column] else "a size above 0 m"
+    unit = " radians" if name == "yaw" else ""
+    expected = f"at most {LIMITS[name]:g}{unit}" if positive[row, column] else "a size above 0 m"
     expected = expected if finite[row, column] else "a finite number"
     raise ValueError(f"{place(int(row))}: {name}: got {boxes[row, column]:g}, expected {expected}")
 

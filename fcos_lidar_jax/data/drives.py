@@ -20,6 +20,7 @@ from fcos_lidar_jax.sensors import Sensor
 
 MAX_POSE_GAP_US = 500_000  # largest distance of neighbours between which poses are interpolated
 _FASTEST_M_PER_S = 100.0  # between two poses
+_MAX_GAP_S = 10.0  # between two sweeps
 _MAX_RATIO = 3  # between the numbers of points in two clouds of one sensor
 _LATEST_S = 1e12  # larger values are not timestamps
 _NANOSECOND_DIGITS = range(16, 20)  # file names with this many digits are nanoseconds
@@ -56,6 +57,8 @@ def _jump(before: Sweep, sweep: Sweep) -> str | None:
     passed_s = (sweep.time_us - before.time_us) / 1e6
     if moved_m > _FASTEST_M_PER_S * passed_s > 0:
         return f"its pose is {moved_m:.1f} m away, {passed_s:g} s after"
+    if passed_s > _MAX_GAP_S:
+        return f"its time is {passed_s:g} s after"
     numbers = len(before.points), len(sweep.points)
     if max(numbers) > _MAX_RATIO * min(numbers) > 0:
         return f"it has {numbers[1]} points, after {numbers[0]} of"
@@ -222,4 +225,9 @@ def read_tum(path: Path) -> PoseTrack:
         rows.append((scalar, *vector, x, y, z))
     if not rows:
         raise ValueError(f"{path}: no pose in it, expected lines t x y z qx qy qz qw")
-    return make_track(times, rows, places.__getitem__)
+    track = make_track(times, rows, places.__getitem__)
+    w, x, y, z = track.rotations.T
+    if len(inverted := np.flatnonzero(x * x + y * y > w * w + z * z)):
+        expected = "expected t x y z qx qy qz qw, with qw last"
+        tell(f"note: {places[inverted[0]]}: turns z down: {expected}", once="z down")
+    return track

@@ -11,7 +11,7 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
-from fcos_lidar_jax.fields import unknown_name
+from fcos_lidar_jax.fields import check, unknown_name
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
@@ -39,6 +39,7 @@ _FIELDS = (
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
 _TYPES = {name.lower(): name for name in (*CLASSES, "DontCare")}
+_MAX_TILT_DEG = 25  # of a camera against the Velodyne; KITTI's has about one
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -101,7 +102,7 @@ class KittiFrames(FrameSet):
         boxes = boxes.astype(np.float32)
         points = read_points(self._file("velodyne", name), self.sensor)
         if self.image_size is not None:
-            points = points[in_image(points, calibration["P2"] @ calibration["velo_to_rect"], self.image_size)]
+            points = points[_in_left_image(points, calibration, self._file("calib", name))]
         points, num_close = drop_close(points, self.sensor, self.reading)
         return Frame(points, boxes, labels, count_inside(points, boxes), num_close)
 
@@ -180,7 +181,16 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
         return points
     matrices = read_calibration(calibration)
     tell(cropped(file.parent), once=True)
-    return points[in_image(points, matrices["P2"] @ matrices["velo_to_rect"], IMAGE_SIZE)]
+    return points[_in_left_image(points, matrices, calibration)]
+
+
+def _in_left_image(points: np.ndarray, calibration: dict[str, np.ndarray], file: Path) -> np.ndarray:
+    """:func:`in_image` for KITTI's left colour camera; the calibration of another camera is refused."""
+    centre, size = calibration["P2"][:2, 2], np.array(IMAGE_SIZE)
+    if (np.abs(centre - size / 2) > size / 10).any():
+        found = f"got a principal point of {centre.round().tolist()}, expected one near the middle of {IMAGE_SIZE}"
+        raise ValueError(f"{file}: P2: {found} pixels, KITTI's image; --full-turn keeps all points")
+    return in_image(points, calibration["P2"] @ calibration["velo_to_rect"], IMAGE_SIZE)
 
 
 def cropped(folder: Path) -> str:
@@ -247,7 +257,11 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
     matrices = read_matrices(file, _SHAPES, ("R0_rect", "Tr_velo_to_cam"))
     to_rect, to_camera = np.eye(4), np.eye(4)
     to_rect[:3, :3], to_camera[:3] = matrices["R0_rect"], matrices["Tr_velo_to_cam"]
-    return {"velo_to_rect": to_rect @ to_camera, "P2": matrices["P2"]}
+    velo_to_rect = to_rect @ to_camera
+    tilt_deg = np.degrees(np.arccos(np.clip(-velo_to_rect[1, 2], -1, 1)))  # boxes are upright in both frames
+    found, expected = f"y at {tilt_deg:.0f} degrees from down", "x right, y down, z forward in the camera"
+    check(bool(tilt_deg <= _MAX_TILT_DEG), f"{file}: Tr_velo_to_cam", found, expected)
+    return {"velo_to_rect": velo_to_rect, "P2": matrices["P2"]}
 
 
 def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.sensors import Sensor
 
+_GAP_US = (1_000, 10_000_000)  # plausible mean time between sweeps; others are not microseconds
 FARTHEST_M = 1e8  # beyond any place on earth in any map's coordinates
 
 _Metres = Annotated[float, msgspec.Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
@@ -111,6 +112,10 @@ def read_list(path: Path) -> list[ListedSweep]:
         if sweep.timestamp_us >= newer.timestamp_us:
             expected = f"less than {newer.timestamp_us} of the entry before: the current sweep first, then by age"
             raise ValueError(f"{path}: $[{index}].timestamp_us: got {sweep.timestamp_us}, expected {expected}")
+    gap_us = (sweeps[0].timestamp_us - sweeps[-1].timestamp_us) / max(len(sweeps) - 1, 1)
+    if len(sweeps) > 1 and not _GAP_US[0] <= gap_us <= _GAP_US[1]:
+        expected = f"microseconds, {_GAP_US[0]} to {_GAP_US[1]} from sweep to sweep"
+        raise ValueError(f"{path}: timestamp_us: got {gap_us:g} on average, expected {expected}")
     return sweeps
 
 

@@ -18,7 +18,7 @@ def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
     if not file.is_file():
         raise ValueError(f"{file}: no such file, expected {what}")
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = file.read_text(encoding="utf-8-sig").splitlines()  # Windows editors write a byte order mark
     except OSError as error:
         raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

@@ -1,5 +1,6 @@
 """JSON files with a list of boxes per sample, read sample by sample, with precise error messages."""
 
+import codecs
 import json
 import mmap
 import re
@@ -76,12 +77,12 @@ def _make(kind: Any, value: Any) -> Any:
 
 
 def _plain_json(text: Text) -> bytes:
-    """Replace NaN by ``null`` and infinities by strings, which are not valid numbers."""
+    """Remove a byte order mark, and replace NaN by ``null`` and infinities by strings, which are not numbers."""
 
     def plain(match: re.Match[bytes]) -> bytes:
         return match[0] if not match[1] else b"null" if match[1] == b"NaN" else b'"%s"' % match[1]
 
-    return _NOT_FINITE.sub(plain, bytes(text))
+    return _NOT_FINITE.sub(plain, bytes(text).removeprefix(codecs.BOM_UTF8))
 
 
 class _Token:

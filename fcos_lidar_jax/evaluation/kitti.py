@@ -89,6 +89,8 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
     widths = [max(9, len(head) + 1) for head in TABLE_HEAD]
     lines = [title.ljust(28) + "".join(map(str.rjust, values, widths)) for title, values in rows]
     few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
+    if not any(n for scores in metrics["classes"].values() for n in scores["num_truth"].values()):
+        lines.append("no object is evaluated: the difficulty needs labels with boxes in the image, 25 pixels high")
     if few:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
     if skipped := [f"{count} {name}" for name, count in metrics["unknown_types"].items()]:

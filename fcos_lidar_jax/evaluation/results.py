@@ -65,16 +65,21 @@ def read_results(
     warnings = _check_meta(file.meta, name)
     row = {token: i for i, token in enumerate(tokens)}
     found, parts = list[str](), [NO_BOXES]
-    irregular = {"rotation": list[str](), "attribute": list[str]()}
+    irregular = {"rotation": list[str](), "order": list[str](), "attribute": list[str]()}
     for token, boxes in json_io.decode_samples(file.results, list[Box], name, field="results"):
         found.append(token)
         if boxes and token in row:
             where = f"{name}: sample {token}"
-            columns, norm = _columns(row[token], boxes, where=where, token=token)
+            columns, rotation = _columns(row[token], boxes, where=where, token=token)
             parts.append(columns)
+            norm, (w, x, y, z) = np.linalg.norm(rotation, axis=1), rotation.T
             irregular["rotation"] += [
                 f"{where}: box {i}: rotation: normalised, got a quaternion of norm {norm[i]:.6g}"
                 for i in np.flatnonzero(np.abs(norm - 1) > 1e-3)
+            ]
+            irregular["order"] += [
+                f"{where}: box {i}: rotation: upside down, got {rotation[i].tolist()}, expected w, x, y, z"
+                for i in np.flatnonzero(x * x + y * y > w * w + z * z)
             ]
             irregular["attribute"] += [
                 f"{where}: box {i}: attribute_name: counted as wrong, got {box.attribute_name!r} for a "
@@ -96,7 +101,7 @@ def _check_meta(meta: dict[str, Any], name: str) -> list[str]:
 
 
 def _columns(sample: int, boxes: list[Box], *, where: str, token: str) -> tuple[BoxColumns, np.ndarray]:
-    """Boxes of one sample and the norms of their quaternions."""
+    """Boxes of one sample and their quaternions."""
     if len(boxes) > MAX_BOXES:
         raise ValueError(f"{where}: box {MAX_BOXES}: got {len(boxes)} boxes, expected at most {MAX_BOXES}")
     columns, rotation = json_io.geometry(boxes, where)
@@ -107,7 +112,7 @@ def _columns(sample: int, boxes: list[Box], *, where: str, token: str) -> tuple[
     label = json_io.index_of(boxes, "detection_name", LABELS, where)
     attribute = json_io.index_of(boxes, "attribute_name", ATTRIBUTE_INDEX, where)
     rows = make_columns(sample=sample, label=label, attribute=attribute, score=score, **columns)
-    return rows, np.linalg.norm(rotation, axis=1)
+    return rows, rotation
 
 
 MOVING_MPS = 0.2  # objects above this speed get a moving attribute

@@ -207,7 +207,12 @@ def recorded_config(config: Config, frames: FrameSet) -> dict[str, Any]:
 
 
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
-    clouds = {index: frames.frame(index).points for index in spread_indices(len(frames), 5)}
+    read = {index: frames.frame(index) for index in spread_indices(len(frames), 5)}
+    inside = np.concatenate([frame.num_points for frame in read.values()])
+    if (num_empty := int((inside == 0).sum())) > len(inside) / 2:
+        found = f"{num_empty} of {len(inside)} boxes of {len(read)} frames contain no point"
+        yield f"{found} and are not learned: are points and boxes in the same frame?"
+    clouds = {index: frame.points for index, frame in read.items()}
     for index, points in clouds.items():
         check_num_lags(points[:, 4], frames.name(index), config.num_sweeps)
         if mismatch := sensor_mismatch(points, frames.sensor):

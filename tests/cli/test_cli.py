@@ -164,7 +164,7 @@ def test_file_names_may_hold_formulas_and_invalid_utf8(home, tmp_path):
 def test_detect_fuses_sweeps(home, tmp_path):
     sweep = {"file": str(home / "good.npy"), "sensor_to_world": np.eye(4).tolist()}
     out, sweeps = tmp_path / "boxes.json", tmp_path / "sweeps.json"
-    sweeps.write_text(json.dumps([{**sweep, "timestamp_us": 10**6 - i} for i in range(3)]))
+    sweeps.write_text(json.dumps([{**sweep, "timestamp_us": 10**6 - 50_000 * i} for i in range(3)]))
     several = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
     save_checkpoint(tmp_path / "several", Checkpoint(several, TINY, untrained(several, TINY), 7))
     command("detect --sweeps", sweeps, "--checkpoint", tmp_path / "several", "--out", out)

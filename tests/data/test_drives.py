@@ -52,33 +52,42 @@ def test_clouds_named_by_times_are_in_temporal_order(poses):
 
 
 @pytest.mark.parametrize(
-    ("numbers", "places_m", "told"),
+    ("numbers", "places_m", "step_s", "told"),
     [
-        ((9, 9, 9, 9), (0, 3, 6, 9), ""),
-        ((9, 0, 20, 9), (0, 3, 6, 9), ""),  # empty clouds are told elsewhere
+        ((9, 9, 9, 9), (0, 3, 6, 9), 0.1, ""),
+        ((9, 0, 20, 9), (0, 3, 6, 9), 0.1, ""),  # empty clouds are told elsewhere
         (
             (9, 9, 30, 9),
             (0, 3, 6, 9),
+            0.1,
             "note: 2: it has 30 points, after 9 of 1: clouds of several sensors or drives?\n",
         ),
         (
             (9, 2, 9, 2),
             (0, 3, 6, 9),
+            0.1,
             "note: 1: it has 2 points, after 9 of 0: clouds of several sensors or drives?\n",
         ),
         (
             (9, 9, 9, 9),
             (0, 40, 0, 40),
+            0.1,
             "note: 1: its pose is 40.0 m away, 0.1 s after 0: clouds of several sensors or drives?\n",
+        ),
+        (
+            (9, 9, 9, 9),
+            (0, 3, 6, 9),
+            100,  # nanoseconds
+            "note: 1: its time is 100 s after 0: clouds of several sensors or drives?\n",
         ),
     ],
 )
-def test_clouds_that_jump_are_told_once(capsys, numbers, places_m, told):
+def test_clouds_that_jump_are_told_once(capsys, numbers, places_m, step_s, told):
     sweeps = []
     for i, (number, x) in enumerate(zip(numbers, places_m, strict=True)):
         pose = np.eye(4)
         pose[0, 3] = x
-        sweeps.append(Sweep(np.repeat(CLOUD, number, axis=0), pose, i * 100_000, str(i)))
+        sweeps.append(Sweep(np.repeat(CLOUD, number, axis=0), pose, round(i * step_s * 1e6), str(i)))
     assert list(Drive(sweeps).sweeps) == sweeps
     assert capsys.readouterr().err == told
 
@@ -152,6 +161,14 @@ def test_lines_that_are_not_poses_are_refused(tmp_path, line):
     (tmp_path / "poses.txt").write_text(f"# t\n0 0 0 0 0 0 0 1\n{line}\n")
     with refused("poses.txt: line 3: "):
         read_tum(tmp_path / "poses.txt")
+
+
+def test_poses_that_turn_z_down_are_told(tmp_path, capsys):
+    """The quaternion's scalar comes last."""
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 1 0 0 0\n")
+    read_tum(tmp_path / "poses.txt")
+    expected = "poses.txt: line 2: turns z down: expected t x y z qx qy qz qw, with qw last\n"
+    assert capsys.readouterr().err == f"note: {tmp_path}/{expected}"
 
 
 def test_a_scene_consists_of_all_its_sweeps_or_its_keyframes(tmp_path):

@@ -37,7 +37,7 @@ def root(tmp_path):
     np.save(tmp_path / "secret.npy", points)  # outside the folder
     np.array([[9, 1, -1, 30, 2], [0.2, -0.9, 0, 1, 3]], np.float32).tofile(root / "clouds" / "a.pcd.bin")
     write(root / "boxes" / "b.json", {"boxes": [CAR]})
-    write(root / "boxes" / "a.json", {"boxes": []})
+    write(root / "boxes" / "a.json", '\ufeff{"boxes": []}')  # as editors of Windows write it
     return root
 
 

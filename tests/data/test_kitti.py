@@ -197,6 +197,13 @@ BAD = {
     "scaled": (C, calibration_text(rectified=2 * RECTIFIED), "line 3: R0_rect: got no rotation"),
     "far away": (C, calibration_text().replace(f"{SHIFT[0]:.12e}", "1e7"), "takes box 0 of the labels far away"),
     "mirrored": (C, calibration_text(mounted=-MOUNTED), "line 4: Tr_velo_to_cam: got no rotation"),
+    "identity": (C, calibration_text(np.eye(3), np.eye(3)), "Tr_velo_to_cam: got 'y at 90 degrees from down'"),
+    "wide image": (
+        C,
+        re.sub("6.060*e[+]02", "960", calibration_text()),
+        "P2: got a principal point of [960.0, 178.0]",
+    ),
+    "degrees": (L, label(ry="-90"), "line 2: yaw: got -90, expected at most 12.5664 radians"),
     "unknown frame": (S, "000007\n../label_2/000007\n", "line 2: got '../label_2/000007', expected the name of"),
     "frame twice": (S, "000007\n\n000007\n", "line 3: got '000007' a second time"),
     "empty split": (S, "\n", "no frame in it, expected at least one"),
@@ -206,7 +213,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_damaged_files_are_refused(root, case):
     file, content, message = BAD[case]
-    write(root / S, "000007\n")
+    write(root / S, "\ufeff000007\n")  # as editors of Windows write it
     (root / file).unlink(missing_ok=True)
     if content is not None:
         (root / file).write_bytes(content if isinstance(content, bytes) else content.encode())

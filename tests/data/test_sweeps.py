@@ -57,7 +57,7 @@ def test_sweeps_can_be_raw_files_of_another_layout(tmp_path):
 @pytest.mark.parametrize(("mode", "counts"), [("all", [1, 1]), ("sweeps", [2, 1]), ("none", [2, 2])])
 def test_close_points_are_removed_in_the_frame_of_their_own_sweep(tmp_path, mode, counts):
     np.save(tmp_path / "a.npy", np.array([[0.5, 0, 0], [10, 0, 0]]))
-    entries = [entry(timestamp_us=100, sensor_to_world=[[1, 0, 0, 10], *EYE[1:]]), entry(timestamp_us=50)]
+    entries = [entry(timestamp_us=60_000, sensor_to_world=[[1, 0, 0, 10], *EYE[1:]]), entry()]
     fused, num_close = fuse(tmp_path, entries, remove_close=mode)
     assert [int((fused[:, 4] == 0).sum()), int((fused[:, 4] > 0).sum())] == counts
     assert num_close == 4 - sum(counts)
@@ -75,16 +75,16 @@ def test_close_points_are_removed_around_the_origin_of_the_sensor(tmp_path):
 def test_sweeps_may_be_empty(tmp_path):
     np.save(tmp_path / "a.npy", np.full((3, 3), 9.0))
     np.save(tmp_path / "none.npy", np.zeros((0, 3)))
-    assert fuse(tmp_path, [entry(timestamp_us=9), entry("none.npy", timestamp_us=1)])[0].shape == (3, 5)
-    assert fuse(tmp_path, [entry("none.npy", timestamp_us=9), entry(timestamp_us=1)])[0].shape == (0, 5)
+    assert fuse(tmp_path, [entry(timestamp_us=9000), entry("none.npy")])[0].shape == (3, 5)
+    assert fuse(tmp_path, [entry("none.npy", timestamp_us=9000), entry()])[0].shape == (0, 5)
 
 
 def test_a_current_sweep_without_usable_points_is_not_filled_by_older_ones(tmp_path):
     np.save(tmp_path / "a.npy", np.full((3, 3), 9.0))
     np.save(tmp_path / "bad.npy", np.full((2, 3), np.nan))
     np.save(tmp_path / "half.npy", np.array([[np.nan] * 3, [9.0] * 3]))
-    assert fuse(tmp_path, [entry("bad.npy", timestamp_us=9), entry(timestamp_us=1)])[0].shape == (2, 5)
-    assert fuse(tmp_path, [entry("half.npy", timestamp_us=9), entry(timestamp_us=1)])[0].shape == (5, 5)
+    assert fuse(tmp_path, [entry("bad.npy", timestamp_us=9000), entry()])[0].shape == (2, 5)
+    assert fuse(tmp_path, [entry("half.npy", timestamp_us=9000), entry()])[0].shape == (5, 5)
 
 
 @pytest.mark.parametrize(
@@ -134,6 +134,14 @@ BAD_SWEEPS = {
     "oldest first": (
         [entry(timestamp_us=9), entry(timestamp_us=1), entry(timestamp_us=8)],
         "$[2].timestamp_us: got 8, expected less than 1 of the entry before: the current sweep first, then by",
+    ),
+    "nanoseconds": (
+        [entry(timestamp_us=50 * 10**6 + 1), entry()],
+        "timestamp_us: got 5e+07 on average, exp",
+    ),
+    "milliseconds": (
+        [entry(timestamp_us=51), entry()],
+        "timestamp_us: got 50 on average, exp",
     ),
     "twice": ([entry(timestamp_us=9), *2 * [entry(timestamp_us=1)]], "$[2].timestamp_us: got 1, expected less"),
 }

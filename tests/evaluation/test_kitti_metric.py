@@ -135,6 +135,8 @@ def test_the_table_counts_the_objects_of_each_difficulty(tmp_path):
     assert " ".join(bev.split()) == "Car 0.7 bev 0.00 0.00 0.00 1 / 4 / 4"
     assert " ".join(cyclist.split()) == "Cyclist 0.5 3d - - - 0 / 0 / 0"
     assert len(head) == len(bev) == len(cyclist)
+    unseen = evaluate_texts(tmp_path, [(line(high=0), line(score=0.5))])  # labels without boxes in the image
+    assert "no object is evaluated: the difficulty needs labels with boxes in the" in describe_kitti(unseen)
 
 
 def test_an_overlap_must_exceed_the_least_and_space_counts_the_height(tmp_path):

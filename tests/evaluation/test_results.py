@@ -126,16 +126,17 @@ def test_missing_files_and_folders_are_rejected(tmp_path):
 def test_irregularities_are_accepted_with_a_warning(tmp_path):
     file = tmp_path / "results.json"
     source = document(rotation=[0.0, 0.0, 0.0, 3.0], velocity=[float("nan"), 1.0])
-    source["results"]["c"][0] |= {"velocity": None, "rotation": [2, 0, 0, 0], "detection_score": 1, "extra": 0}
+    source["results"]["c"][0] |= {"velocity": None, "rotation": [0, 2, 0, 0], "detection_score": 1, "extra": 0}
     source["meta"] = {"use_lidar": True, "method": "a [NaN, Infinity] b"}
-    file.write_text(json.dumps(source))
+    file.write_text(json.dumps(source), encoding="utf-8-sig")
     results = read_results(file, TOKENS)
     assert results.meta == source["meta"]  # NaN within a string is unchanged
     np.testing.assert_allclose(results.boxes.yaw, [0, np.pi, 0])
     np.testing.assert_array_equal(results.boxes.velocity, [[0.5, 0], [np.nan, 1], [np.nan, np.nan]])
-    meta, rotation = results.warnings
+    meta, rotation, order = results.warnings
     assert "meta: use_camera, use_radar, use_map, use_external: missing" in meta
     assert "sample b: box 1: rotation: normalised, got a quaternion of norm 3, and 1 more" in rotation
+    assert "sample c: box 0: rotation: upside down, got [0.0, 2.0, 0.0, 0.0], expected w, x, y, z" in order
     assert read_results(document(), TOKENS).warnings == ()
     [line] = read_results(document(attribute_name="pedestrian.moving"), TOKENS).warnings  # as in the devkit
     assert line.endswith("sample b: box 1: attribute_name: counted as wrong, got 'pedestrian.moving' for a car")

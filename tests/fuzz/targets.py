@@ -218,8 +218,9 @@ def _kitti_files() -> dict[str, bytes]:
 
 def _folder_files() -> dict[str, bytes]:
     box = {"label": "car", "box": [8, 1, -1, 4, 2, 1.5, 0.3, None, None]}
+    times_us = {"a": 9000, "b": 5000}
     listed = [
-        {"file": f"../clouds/{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("b", 5))
+        {"file": f"../clouds/{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in times_us.items()
     ]
     clouds = {f"clouds/{name}.npy": _saved(np.save, POINTS.astype("f4")) for name in "ab"}
     return clouds | {
@@ -461,7 +462,7 @@ def make_targets() -> list[Target]:
     tables = _files(lambda folder: write_nuscenes(folder, *make_tables(1)))
     index = _files(_index_files)
     synthesized = _files(_synthesize)
-    listed = [{"file": f"{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("a", 5))]
+    listed = [{"file": "a.npy", "timestamp_us": t, "sensor_to_world": POSE} for t in (9000, 5000)]
     found = {"a": [], "b": [{**_box(), "sample_token": "b", "detection_score": 0.5}] * 2}
     truth = {t: {"ego_translation": [0.0, 0, 0], "boxes": [_box(num_pts=3)] * 2} for t in "ab"}
     truth["b"]["boxes"] = [_box(detection_name="static_object.bicycle_rack", attribute_name="", num_pts=-1)]
