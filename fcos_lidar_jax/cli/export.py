@@ -14,6 +14,7 @@ from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.export import PLATFORMS, Size, export_detector, load_exported
 from fcos_lidar_jax.inference.onnx_graph import network_graph
+from fcos_lidar_jax.inference.onnx_program import program_graph
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Export:
     """Export a detector to one file, from points to boxes, that runs with only jax and flatbuffers installed.
 
     The file runs on CPUs, GPUs and TPUs. detect, stream, evaluate and benchmark accept it as --checkpoint. With
-    --network-only --format onnx, the command writes the network as an ONNX graph instead.
+    --format onnx, the command writes an ONNX graph for other runtimes instead.
     """
 
     checkpoint: options.Trained
@@ -30,27 +31,24 @@ class Export:
     """Rows of a cloud including padding; `any` compiles once per number of rows."""
     batch: Annotated[Size, option("N|any")] = 1
     """Clouds per call, or any number. Another size changes boxes and scores by rounding."""
-    network_only: bool = False  # Leave out projection, decoding and NMS, for other runtimes. Needs --format onnx.
-    format: Literal["jax", "onnx"] = "jax"
-    """A program of jax.export, or an ONNX graph of the network."""
+    network_only: bool = False  # Leave out projection, decoding and NMS. Needs --format onnx.
+    format: Literal["jax", "onnx"] = "jax"  # A program of jax.export, or an ONNX graph.
 
 
 def run(args: Export) -> None:
     """Export the detector, write the file, and print a record of it."""
     checkpoint = find_checkpoint(args.checkpoint)
     check_outputs(args.checkpoint, (), out=args.out)
-    if args.network_only != (args.format == "onnx"):
-        raise ValueError(
-            "export: expected --network-only and --format onnx together: only the network has an ONNX form"
-        )
-    (_export_network if args.network_only else _export_program)(args, checkpoint)
+    if args.network_only and args.format != "onnx":
+        raise ValueError("--network-only: expected --format onnx: only the network's ONNX graph stands alone")
+    (_export_onnx if args.format == "onnx" else _export_program)(args, checkpoint)
 
 
-def _export_network(args: Export, checkpoint: Path) -> None:
+def _export_onnx(args: Export, checkpoint: Path) -> None:
     if (args.points, args.batch) != (None, 1):
-        raise ValueError("--points, --batch: expected without --network-only, whose graph takes any batch")
+        raise ValueError("--points, --batch: expected without --format onnx")
     detector = load_trained(checkpoint)
-    content = network_graph(detector)
+    content = (network_graph if args.network_only else program_graph)(detector)
     atomic_write(args.out, lambda path: path.write_bytes(content))
     print(json.dumps({"file": str(args.out), "bytes": len(content), "name": detector.config.name}))
 

@@ -108,7 +108,6 @@ def run(args: Stream) -> None:
     aligned = alignment_of(args, sensor, paths, scene_sensor)
     drive = _open(args, kind, detector, aligned.data)
     _tell_notes(drive.notes)
-    tell("compiling the detector")
     how: dict[str, Any] = {"aligned": aligned, "at_us": drive.at_us}
     if not drive.posed:
         how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
@@ -116,6 +115,7 @@ def run(args: Stream) -> None:
     add_tracks = _tracker(classes)
     views = {"title": args.scene or str(args.source), "in_lines": True}
     with contextlib.ExitStack() as sinks, _Timing() as timing:
+        sinks.callback(_tell_notes, drive.notes)  # also if the source fails
         add = sinks.enter_context(open_sinks(args, classes, aligned.data, **views))
         with closing_at_failure(sinks, notes):
             for found in detect_stream(_in_order(drive, timing), detector, **how):
@@ -135,7 +135,6 @@ def run(args: Stream) -> None:
                 timing.end_sweep()
         if line := unusable_clouds([*filter(None, notes)], len(notes)):
             drive.notes.append(line)
-    _tell_notes(drive.notes)
     if line := truncation(num_truncated, detector.config):
         tell(line)
     tell(timing.summary())
@@ -145,18 +144,20 @@ def _in_order(drive: Drive, timing: "_Timing") -> Iterator[Sweep]:
     """Yield the sweeps; with poses, only sweeps that are later than all earlier ones. A note counts the others."""
     latest_us, others = -math.inf, list[str]()
     timing.begin("reading")
-    for sweep in drive.sweeps:
-        timing.begin("detection")
-        if sweep.time_us <= latest_us:
-            others.append(sweep.name)
-        if sweep.time_us > latest_us or not drive.posed:
-            yield sweep
-        latest_us = max(latest_us, sweep.time_us)
-        timing.begin("reading")
-    if others:
-        how = "skipped" if drive.posed else "kept, since the order only matters with poses"
-        found = f"sweeps that are not later than all before: {len(others)}, the first is {others[0]}"
-        drive.notes.append(f"{found}; {how}")
+    try:
+        for sweep in drive.sweeps:
+            timing.begin("detection")
+            if sweep.time_us <= latest_us:
+                others.append(sweep.name)
+            if sweep.time_us > latest_us or not drive.posed:
+                yield sweep
+            latest_us = max(latest_us, sweep.time_us)
+            timing.begin("reading")
+    finally:
+        if others:
+            how = "skipped" if drive.posed else "kept, since the order only matters with poses"
+            found = f"sweeps that are not later than all before: {len(others)}, the first is {others[0]}"
+            drive.notes.append(f"{found}; {how}")
 
 
 def _tracker(classes: tuple[str, ...]) -> Callable[[list[dict[str, Any]], Sweep], None]:

@@ -36,7 +36,7 @@ class Drive:
     at_us: Collection[int] | None = None  # times of the sweeps to detect in; None for all
     tokens: Mapping[int, str] = dataclasses.field(default_factory=dict)  # time -> sample token of nuScenes
     notes: list[str] = dataclasses.field(default_factory=list)
-    """Notes about assumptions and, once the last sweep was read, about skipped sweeps."""
+    """Notes about assumptions and, once the last sweep was read or one cannot be read, about skipped sweeps."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sweeps", _watched(self.sweeps))

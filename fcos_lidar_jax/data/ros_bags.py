@@ -84,26 +84,28 @@ def ros_bag_drive(
 
     def read() -> Iterator[Sweep]:
         number, outside, first = 0, list[OutsidePosesError](), None
-        with _Bag(path) as bag:
-            for where, cloud in bag.messages(clouds, _CLOUD):
-                number, time_us, frame = number + 1, _time_us(cloud.header), _frame(cloud.header.frame_id)
-                first = frame if first is None else first
-                if frame != first:
-                    ids = f"frame_id {printable(frame)!r} after {printable(first)!r}"
-                    tell(f"note: {where}: {ids}: clouds of several sensors?", once="frame_id")
-                try:
-                    pose = np.eye(4) if pose_at is None else pose_at(frame, time_us, where)
-                except OutsidePosesError as error:
-                    outside.append(error)
-                    continue
-                points = _parse_cloud(cloud, where, sensor, max_points=max_points)
-                yield Sweep(points, pose, time_us, where)
+        try:
+            with _Bag(path) as bag:
+                for where, cloud in bag.messages(clouds, _CLOUD):
+                    number, time_us, frame = number + 1, _time_us(cloud.header), _frame(cloud.header.frame_id)
+                    first = frame if first is None else first
+                    if frame != first:
+                        ids = f"frame_id {printable(frame)!r} after {printable(first)!r}"
+                        tell(f"note: {where}: {ids}: clouds of several sensors?", once="frame_id")
+                    try:
+                        pose = np.eye(4) if pose_at is None else pose_at(frame, time_us, where)
+                    except OutsidePosesError as error:
+                        outside.append(error)
+                        continue
+                    points = _parse_cloud(cloud, where, sensor, max_points=max_points)
+                    yield Sweep(points, pose, time_us, where)
+        finally:
+            if 0 < len(outside) < number:
+                notes.append(f"{len(outside)} clouds before the first or after the last pose were skipped")
         if number == 0:
             raise ValueError(f"{path}: {printable(clouds)}: no cloud in it, expected at least one")
         if len(outside) == number:
             raise outside[0]
-        if outside:
-            notes.append(f"{len(outside)} clouds before the first or after the last pose were skipped")
 
     return Drive(read(), posed=pose_at is not None, notes=notes)
 

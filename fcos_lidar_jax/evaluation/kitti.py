@@ -1,4 +1,4 @@
-"""KITTI's own metric: average precision at 40 recall positions, by overlap from above and in 3D."""
+"""KITTI's own metric: average precision at 40 recall positions, by overlap from above, in 3D and in the image."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,13 +12,20 @@ from fcos_lidar_jax.data.kitti import CLASSES, read_objects
 from fcos_lidar_jax.fields import unknown_name
 
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
-"""Class that KITTI evaluates -> overlap that a detection must exceed, from above and in 3D."""
+"""Class that KITTI evaluates -> overlap that a detection must exceed, from above, in 3D and in the image."""
 DIFFICULTIES = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
 """Minimum image height (pixels), maximum occlusion and truncation of the evaluated objects."""
+KINDS = ("bev", "3d", "image", "aos")
+"""Average precision from above, in 3D and of image boxes; average orientation similarity of image boxes."""
 TABLE_HEAD = (*DIFFICULTIES, f"objects: {' / '.join(DIFFICULTIES)}")
 
 _NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _POSITIONS = 40
+_NO_ALPHA = -10
+
+_Pairs = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Objects and detections that overlap enough to match: rows i64[n, 2], ascending; overlaps f64[n]; what a true
+positive counts, f64[n]; and the share of each detection that a DontCare region covers, f64[m]."""
 
 
 def evaluate_kitti(
@@ -29,8 +36,11 @@ def evaluate_kitti(
     Every file of the results is a frame; labels of other frames are not read. An object counts if it has the class
     and is within the limits of the difficulty. Other objects of the class, and its neighbours (vans for cars,
     sitting persons for pedestrians), are ignored: they may be detected or missed. Detections that are lower in the
-    image than the difficulty's limit are ignored, too. DontCare regions do not excuse detections, because
-    they have no position in 3D. The overlap of image boxes and the orientation (AOS) are not evaluated.
+    image than the difficulty's limit are ignored, too. In the image, so are detections without an object that a
+    DontCare region covers by more than the class's overlap; these regions have no position in 3D.
+
+    The average orientation similarity (AOS) is the average precision in the image, with true positives counting
+    ``(1 + cos(error of alpha)) / 2``.
 
     The mean is over 40 of 41 positions, without the first. With fewer than 41 objects that count, perfect
     detections therefore stay below 100, as in the development kit.
@@ -41,9 +51,11 @@ def evaluate_kitti(
         classes: of :data:`MIN_OVERLAP`.
 
     Returns:
-        ``{"metric": "AP_R40", "num_frames", "classes": {class: {"min_overlap", "num_truth", "bev", "3d"}}}``; the
-        last three by difficulty. An average precision without an object that counts is None. Also
-        ``"unknown_types": {type: lines}``, and ``"image_only"``, the number of detections without a box in 3D.
+        ``{"metric": "AP_R40", "num_frames", "classes": {class: {"min_overlap", "num_truth", "bev", "3d", "image",
+        "aos"}}}``; the last five by difficulty. An average precision without an object that counts is None. If the
+        left side of all image boxes is negative, ``"image"`` and ``"aos"`` are left out; if any alpha is -10,
+        ``"aos"`` is. Also ``"unknown_types": {type: lines}``, and ``"image_only"``, the number of detections
+        without a box in 3D.
 
     Raises:
         ValueError: naming the file, the line and the field, what was found and what was expected.
@@ -66,8 +78,8 @@ def evaluate_kitti(
     flat = np.isnan(found.reach)[np.isin(found.types, CLASSES)]
     if flat.all() and len(flat):
         raise ValueError(f"{results_dir}: got boxes in the image only, expected height to rotation_y of 3D boxes")
-    pairs, overlap = _overlapping(truth, found)
-    scores = {name: _evaluate_class(name, truth, found, pairs, overlap) for name in classes}
+    kinds = _overlapping(truth, found)
+    scores = {name: _evaluate_class(name, truth, found, kinds) for name in classes}
     skipped = Counter(name for name in found.types.tolist() if name not in (*CLASSES, "DontCare"))
     told = {"unknown_types": dict(sorted(skipped.items())), "image_only": int(flat.sum())}
     return {"metric": "AP_R40", "num_frames": len(files), "classes": scores, **told}
@@ -82,10 +94,9 @@ def results_folder(folder: str | Path) -> Path:
 def describe_kitti(metrics: dict[str, Any]) -> str:
     """What :func:`evaluate_kitti` returns, as lines of text."""
     rows = [(f"KITTI AP_R40 on {metrics['num_frames']} frames", [*TABLE_HEAD])]
-    for name, scores in metrics["classes"].items():
-        for kind in ("bev", "3d"):
-            values = ["-" if v is None else f"{v:.2f}" for v in scores[kind].values()]
-            rows.append((f"{name} {scores['min_overlap']} {kind}", [*values, object_counts(scores)]))
+    for name, kind, values, counts in table_rows(metrics):
+        cells = ["-" if value is None else f"{value:.2f}" for value in values]
+        rows.append((f"{name} {MIN_OVERLAP[name]} {kind}", [*cells, counts]))
     widths = [max(9, len(head) + 1) for head in TABLE_HEAD]
     lines = [title.ljust(28) + "".join(map(str.rjust, values, widths)) for title, values in rows]
     few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
@@ -96,15 +107,20 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
     if skipped := [f"{count} {name}" for name, count in metrics["unknown_types"].items()]:
         lines.append(f"skipped, none of KITTI's types: {', '.join(skipped)}")
     if metrics["image_only"]:
-        lines.append(f"without a box in 3D, and therefore false: {metrics['image_only']} detections")
+        lines.append(f"without a box in 3D, and therefore false in bev and 3d: {metrics['image_only']} detections")
     if metrics.get("left_out"):
         lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
     return "\n".join(lines)
 
 
-def object_counts(scores: dict[str, Any]) -> str:
-    """Format the numbers of evaluated objects of a class as the last cell of a row under :data:`TABLE_HEAD`."""
-    return " / ".join(map(str, scores["num_truth"].values()))
+def table_rows(metrics: dict[str, Any]) -> list[tuple[str, str, list[float | None], str]]:
+    """Class, one of :data:`KINDS`, and the cells under :data:`TABLE_HEAD`: values, and numbers of objects."""
+    return [
+        (name, kind, [*scores[kind].values()], " / ".join(map(str, scores["num_truth"].values())))
+        for name, scores in metrics["classes"].items()
+        for kind in KINDS
+        if kind in scores
+    ]
 
 
 class _Objects:
@@ -116,21 +132,44 @@ class _Objects:
         self.ends = np.cumsum([len(types) for types, _ in read])
         self.types = np.array([name for types, _ in read for name in types], np.str_)
         self.truncation, self.occlusion, self.boxes, self.scores = *fields[:, :2].T, fields[:, 7:14], fields[:, 14]
-        self.height = np.abs(fields[:, 6] - fields[:, 4])
+        self.alpha, self.image = fields[:, 2], fields[:, 3:7]
+        self.height = np.abs(self.image[:, 3] - self.image[:, 1])
         self.reach = np.hypot(self.boxes[:, 1], self.boxes[:, 2]) / 2
 
 
-def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Rows of truth and detections that overlap enough to match, i64[n, 2], ascending, and overlaps f64[n]."""
-    parts = [np.zeros((0, 2), np.int64)]
+def _overlapping(truth: _Objects, found: _Objects) -> dict[str, _Pairs]:
+    """What may match, for each of :data:`KINDS` that the results have."""
+    near, seen = [np.zeros((0, 2), np.int64)], [np.zeros((0, 2), np.int64)]
+    least, covered = min(MIN_OVERLAP.values()), np.zeros(len(found.types))
     for (i, j), (k, l) in pairwise([(0, 0), *zip(truth.ends, found.ends, strict=True)]):
         a, b = truth.boxes[i:k, None], found.boxes[j:l]
         distance = np.hypot(a[..., 3] - b[..., 3], a[..., 5] - b[..., 5])
-        parts.append(np.argwhere(distance < truth.reach[i:k, None] + found.reach[j:l]) + np.array([i, j]))
-    pairs = np.concatenate(parts)
+        near.append(np.argwhere(distance < truth.reach[i:k, None] + found.reach[j:l]) + np.array([i, j]))
+        overlap, share = _image_overlaps(truth.image[i:k, None], found.image[j:l])
+        seen.append(np.argwhere(overlap > least) + np.array([i, j]))
+        covered[j:l] = share[truth.types[i:k] == "DontCare"].max(axis=0, initial=0.0)
+    pairs = np.concatenate(near)
     bev, volume = overlaps(truth.boxes[pairs[:, 0]], found.boxes[pairs[:, 1]])
-    kept = bev > min(MIN_OVERLAP.values())  # the overlap in space is never greater
-    return pairs[kept], {"bev": bev[kept], "3d": volume[kept]}
+    kept = bev > least  # the overlap in space is never greater
+    others = np.ones(kept.sum()), np.zeros(len(found.types))
+    kinds = {"bev": (pairs[kept], bev[kept], *others), "3d": (pairs[kept], volume[kept], *others)}
+    if not len(covered) or (found.image[:, 0] >= 0).any():
+        pairs = np.concatenate(seen)
+        overlap, _ = _image_overlaps(truth.image[pairs[:, 0]], found.image[pairs[:, 1]])
+        kinds["image"] = pairs, overlap, np.ones(len(pairs)), covered
+        if (found.alpha != _NO_ALPHA).all():
+            similarity = (1 + np.cos(truth.alpha[pairs[:, 0]] - found.alpha[pairs[:, 1]])) / 2
+            kinds["aos"] = pairs, overlap, similarity, covered
+    return kinds
+
+
+def _image_overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """IoU of image boxes f64[..., 4], and the share of b that a covers."""
+    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
+    shared = np.maximum(sides, 0.0).prod(axis=-1)
+    area_a, area_b = ((box[..., 2:] - box[..., :2]).prod(axis=-1) for box in (a, b))
+    some = shared > 0  # boxes without an area share none
+    return shared / np.where(some, area_a + area_b - shared, 1.0), shared / np.where(some, area_b, 1.0)
 
 
 def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -162,11 +201,9 @@ def _shared_area(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (step[..., 1] / 2 * ((at[1:] + at[:-1]) * np.diff(times, axis=0)).sum(axis=0)).sum(axis=1)
 
 
-def _evaluate_class(
-    name: str, truth: _Objects, found: _Objects, pairs: np.ndarray, overlap: dict[str, np.ndarray]
-) -> dict[str, Any]:
+def _evaluate_class(name: str, truth: _Objects, found: _Objects, kinds: dict[str, _Pairs]) -> dict[str, Any]:
     """Number of objects that count and average precisions of a class, by difficulty."""
-    scores: dict[str, Any] = {"min_overlap": MIN_OVERLAP[name], "num_truth": {}, "bev": {}, "3d": {}}
+    scores: dict[str, Any] = {"min_overlap": MIN_OVERLAP[name], "num_truth": {}, **{kind: {} for kind in kinds}}
     ours, neighbour = truth.types == name, truth.types == _NEIGHBOURS.get(name, name)
     for difficulty, (height, occlusion, truncation) in DIFFICULTIES.items():
         within = (truth.height > height) & (truth.occlusion <= occlusion) & (truth.truncation <= truncation)
@@ -174,18 +211,26 @@ def _evaluate_class(
         scores["num_truth"][difficulty] = int(counted.sum())
         # Low detections of any class may be taken by an object, as in the development kit.
         found_counted, found_taken = high & (found.types == name), ~high | (found.types == name)
-        for kind, values in overlap.items():
-            possible = values > MIN_OVERLAP[name]
+        for kind, (pairs, overlap, worth, covered) in kinds.items():
+            possible = overlap > MIN_OVERLAP[name]
             possible &= (ours | neighbour)[pairs[:, 0]] & found_taken[pairs[:, 1]]
-            given = pairs[possible], values[possible], counted, found_counted, found.scores
-            scores[kind][difficulty] = _average_precision(*given) if counted.any() else None
+            found_false = found_counted & (covered <= MIN_OVERLAP[name])
+            given = pairs[possible], overlap[possible], worth[possible], counted, found_counted, found_false
+            scores[kind][difficulty] = _average_precision(*given, found.scores) if counted.any() else None
     return scores
 
 
 def _average_precision(
-    pairs: np.ndarray, overlap: np.ndarray, counted: np.ndarray, found_counted: np.ndarray, scores: np.ndarray
+    pairs: np.ndarray,
+    overlap: np.ndarray,
+    worth: np.ndarray,
+    counted: np.ndarray,
+    found_counted: np.ndarray,
+    found_false: np.ndarray,
+    scores: np.ndarray,
 ) -> float:
-    """Percent, from the pairs that may match; which objects and which detections count, and all scores."""
+    """Percent, from the pairs that may match; which objects and which detections count, which of these are false
+    without an object, and all scores."""
     truth, (rows, column) = pairs[:, 0], np.unique(pairs[:, 1], return_inverse=True)
     valid = found_counted[pairs[:, 1]]
     true_positive = valid & counted[truth]
@@ -195,12 +240,13 @@ def _average_precision(
     # Then, at each threshold, the one with the greatest overlap; ignored detections only if no other is left.
     present = scores[rows][:, None] >= thresholds
     taken = _match(truth, column, np.where(valid, overlap, 0.0), present)
-    num_true = (taken & true_positive[:, None]).sum(axis=0)
-    ordered = np.sort(scores[found_counted])
-    num_false = len(ordered) - np.searchsorted(ordered, thresholds) - (taken & valid[:, None]).sum(axis=0)
+    hits = taken & true_positive[:, None]
+    ordered = np.sort(scores[found_false])
+    num_taken = (taken & found_false[pairs[:, 1], None]).sum(axis=0)
+    num_found = hits.sum(axis=0) + len(ordered) - np.searchsorted(ordered, thresholds) - num_taken
     precision = np.zeros(_POSITIONS + 1)
     # Where nothing counts the development kit has 0 / 0; here the precision is 0.
-    precision[: len(thresholds)] = num_true / np.maximum(num_true + num_false, 1)
+    precision[: len(thresholds)] = worth @ hits / np.maximum(num_found, 1)
     return float(100 * np.maximum.accumulate(precision[::-1])[::-1][1:].mean())
 
 

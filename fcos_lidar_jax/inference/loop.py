@@ -19,6 +19,7 @@ from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.inference.alignment import Alignment
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.types import Detections
 
 _Loaded = dict[int, tuple[Frame, Cloud]]  # by row of the batch, without rows that other processes read
@@ -65,7 +66,7 @@ def detect_clouds(
         devices: by default all, including those of other processes, which make the same call. If one of them
             cannot read its frames, an OSError says so.
         ahead: groups to read ahead. With 0, predictions are returned before the next cloud is requested.
-        quiet: print nothing about the clouds.
+        quiet: print nothing.
     """
     mesh = make_mesh(devices)
     batches = _Batches(config, aligned, [device for device in mesh.devices.flat for _ in range(batch_size)], quiet)
@@ -84,6 +85,8 @@ def detect_clouds(
             if not told and (first := next((f for f, _ in loaded.values() if len(f.points)), None)):
                 aligned.announce(aligned.points(first.points))  # once it was read: an error would make this moot
                 told = True
+            if not quiet:
+                tell("compiling the detector: some seconds on a CPU", once=True)
             running.append((group, loaded, compiled(*shard_batch(clouds, mesh))))
             while len(running) > bool(ahead):
                 yield from batches.collect(*running.popleft())

@@ -7,7 +7,8 @@ projection, decoding and NMS. Images inside the graph are [b, c, h, w].
 import importlib
 import json
 import sys
-from collections.abc import Mapping, Sequence
+import types
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -58,13 +59,25 @@ def network_graph(detector: TrainedDetector) -> bytes:
     float32 regardless of ``config.model.precision``. A second look is not part of the graph. The metadata hold
     classes, configuration and sensor as JSON.
     """
+    graph = Graph(cpu_package("onnx"))
+    shapes, model = add_network(graph, detector, "features"), detector.config.model
+    layout, rounds = image_layout(detector.sensor, model), detector.config.projection.num_rounds
+    image = "b", layout.rows, layout.columns, len(model.channel_mean), rounds
+    features, *outputs = (
+        types.SimpleNamespace(dtype=np.float32, shape=shape)
+        for shape in (image, *(("b", layout.num_locations, *shape) for shape in shapes.values()))
+    )
+    return graph.file(detector, ["features"], [features], [*shapes], outputs, opset=_OPSET, ir_version=_IR_VERSION)
+
+
+def add_network(graph: "Graph", detector: TrainedDetector, features: str) -> dict[str, tuple[int, ...]]:
+    """Add the nodes of the network to a graph; returns the outputs' names with their shapes at a location."""
     config, model = detector.config, detector.config.model
     if type(config) is not Config:
         raise ValueError(f"ONNX: got the detector {config.name!r}, expected one on range images")
-    onnx = cpu_package("onnx")
     layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
-    network = _Network(onnx, without_second_look(detector.variables), circular=model.circular_width)
-    image = _preprocessing(network, "features", model, layout)
+    network = _Network(graph, without_second_look(detector.variables), circular=model.circular_width)
+    image = _preprocessing(network, features, model, layout)
     stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds, len(model.channel_mean)))
     levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks))
     k = len(config.classes)
@@ -73,52 +86,22 @@ def network_graph(detector: TrainedDetector) -> bytes:
     _heads(network, levels, local, model, shapes)
     if unknown := sorted(network.parameters.keys() - network.used):
         raise ValueError(f"ONNX: found the parameters {unknown[0]}, which are not part of the graph")
-    described = onnx.helper.make_tensor_value_info
-    float32 = onnx.TensorProto.FLOAT
-    graph = onnx.helper.make_graph(
-        network.nodes,
-        config.name,
-        [described("features", float32, ["b", layout.rows, layout.columns, len(model.channel_mean), rounds])],
-        [described(name, float32, ["b", layout.num_locations, *shape]) for name, shape in shapes.items()],
-        list(network.constants.values()),
-    )
-    file = onnx.helper.make_model(
-        graph,
-        producer_name="fcos_lidar_jax",
-        producer_version=__version__,
-        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
-        ir_version=_IR_VERSION,
-    )
-    about = {
-        "channels": CHANNELS[: len(model.channel_mean)],
-        "classes": detector.classes,
-        "config": config_to_json(config),
-        "sensor": sensor_to_json(detector.sensor),
-    }
-    onnx.helper.set_model_props(file, {name: json.dumps(value) for name, value in about.items()})
-    return file.SerializeToString(deterministic=True)
+    return shapes
 
 
-class _Network:
-    """Nodes and constants of a graph in order of creation, and the parameters by path."""
+class Graph:
+    """Nodes and constants of a graph in order of creation. Values are float32, int64 for all integers, or bool."""
 
-    def __init__(self, onnx: Any, variables: Any, *, circular: bool) -> None:
-        self.onnx, self.circular = onnx, circular
+    def __init__(self, onnx: Any) -> None:
+        self.onnx = onnx
         self.nodes: list[Any] = []
         self.constants: dict[Any, Any] = {}
-        leaves = jax.tree_util.tree_leaves_with_path(variables)
-        self.parameters = {"/".join(key.key for key in path): np.asarray(leaf) for path, leaf in leaves}
-        self.used: set[str] = set()
-
-    def parameter(self, path: str, kind: str = "params") -> np.ndarray:
-        """A parameter in float64, so that folding rounds only once."""
-        self.used.add(f"{kind}/{path}")
-        return self.parameters[f"{kind}/{path}"].astype(np.float64)
+        self.count = 0  # nodes of this graph and of graphs within it, for unique names
 
     def constant(self, value: Any) -> str:
-        """A constant of float32, or int64 for integers; equal constants are shared."""
+        """The name of a constant; equal constants are shared."""
         array = np.asarray(value)
-        array = np.ascontiguousarray(array, np.int64 if array.dtype.kind == "i" else np.float32)
+        array = np.ascontiguousarray(array, kind_of(array.dtype)).reshape(array.shape)
         key = array.dtype.kind, array.shape, array.tobytes()
         if key not in self.constants:
             name = f"constant{len(self.constants)}"
@@ -127,10 +110,75 @@ class _Network:
 
     def __call__(self, kind: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
         """Add a node and return the name of its output; inputs other than names become constants."""
+        return self.several(kind, *inputs, outputs=[output or f"{kind.lower()}{self.count}"], **attributes)[0]
+
+    def several(self, kind: str, *inputs: Any, outputs: int | list[str], **attributes: Any) -> list[str]:
+        """Add a node with a number of outputs, or with outputs of given names."""
+        if isinstance(outputs, int):
+            outputs = [f"{kind.lower()}{self.count}_{i}" for i in range(outputs)]
         names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
-        output = output or f"{kind.lower()}{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(kind, names, [output], **attributes))
-        return output
+        self.nodes.append(self.onnx.helper.make_node(kind, names, outputs, **attributes))
+        self.count += 1
+        return outputs
+
+    def inner(self, compute: Callable[..., Sequence[Any]], inputs: Sequence[Any], outputs: Sequence[Any]) -> Any:
+        """The graph of a loop or branch, whose nodes ``compute`` adds; arguments describe types and shapes."""
+        outside, self.nodes, self.count = self.nodes, [], self.count + 1
+        names = [f"inner{self.count}_{i}" for i in range(len(inputs))]
+        results = [self("Identity", result) for result in compute(*names)]
+        graph, self.nodes = self._graph("inner", names, inputs, results, outputs), outside
+        return graph
+
+    def _graph(self, name: str, *described: Sequence[Any], constants: Sequence[Any] = ()) -> Any:
+        """A graph of the nodes; inputs and outputs are described by names, and by arrays or the like."""
+        helper, values = self.onnx.helper, []
+        for names, kinds in zip(described[::2], described[1::2], strict=True):
+            types = [helper.np_dtype_to_tensor_dtype(kind_of(kind.dtype)) for kind in kinds]
+            shapes = [kind.shape for kind in kinds]
+            values.append([*map(helper.make_tensor_value_info, names, types, shapes)])
+        return helper.make_graph(self.nodes, name, *values, constants)
+
+    def file(self, detector: TrainedDetector, *described: Sequence[Any], opset: int, ir_version: int) -> bytes:
+        """The bytes of an ONNX file, with channels, classes, configuration and sensor of a detector as JSON."""
+        helper, config = self.onnx.helper, detector.config
+        file = helper.make_model(
+            self._graph(config.name, *described, constants=[*self.constants.values()]),
+            producer_name="fcos_lidar_jax",
+            producer_version=__version__,
+            opset_imports=[helper.make_opsetid("", opset)],
+            ir_version=ir_version,
+        )
+        about = {
+            "channels": CHANNELS[: len(config.model.channel_mean)],
+            "classes": detector.classes,
+            "config": config_to_json(config),
+            "sensor": sensor_to_json(detector.sensor),
+        }
+        helper.set_model_props(file, {name: json.dumps(value) for name, value in about.items()})
+        return file.SerializeToString(deterministic=True)
+
+
+def kind_of(dtype: Any) -> Any:
+    """The type of values in the graph: int64 for all integers, float32 for all floating-point numbers."""
+    return np.dtype({"b": np.bool_, "i": np.int64, "u": np.int64}.get(np.dtype(dtype).kind, np.float32))
+
+
+class _Network:
+    """A graph to which the layers of a network are added, and the parameters by path."""
+
+    def __init__(self, graph: Graph, variables: Any, *, circular: bool) -> None:
+        self.graph, self.circular = graph, circular
+        leaves = jax.tree_util.tree_leaves_with_path(variables)
+        self.parameters = {"/".join(key.key for key in path): np.asarray(leaf) for path, leaf in leaves}
+        self.used: set[str] = set()
+
+    def __call__(self, kind: str, *inputs: Any, **options: Any) -> str:
+        return self.graph(kind, *inputs, **options)
+
+    def parameter(self, path: str, kind: str = "params") -> np.ndarray:
+        """A parameter in float64, so that folding rounds only once."""
+        self.used.add(f"{kind}/{path}")
+        return self.parameters[f"{kind}/{path}"].astype(np.float64)
 
     def conv(
         self, x: str, kernel: np.ndarray, *bias: np.ndarray, stride: int = 1, dilation: int = 1, groups: int = 1

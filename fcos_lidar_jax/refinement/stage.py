@@ -55,7 +55,7 @@ def add_refinement(detector: "Detector") -> "Detector":
         )
 
     def sums(variables: Any, outputs: Any, inputs: Any, batch: Batch) -> Sums:
-        of_boxes = refinement_sums(detector, network, variables, outputs, inputs, batch)
+        of_boxes = refinement_sums(detector, variables, outputs, inputs, batch)
         if refinement.freeze_detector:
             return of_boxes
         of_detector = detector.sums(without_second_look(variables), outputs, inputs, batch)
@@ -149,19 +149,20 @@ def refine_boxes(
         return suppress(place, scores, labels, used, dataclasses.replace(config.inference, merge_iou=None))
 
 
-def refinement_sums(
-    detector: "Detector",
-    network: SecondLook,
-    variables: Any,
-    outputs: Any,
-    inputs: Any,
-    batch: Batch,
-) -> Sums:
+def refinement_sums(detector: "Detector", variables: Any, outputs: Any, inputs: Any, batch: Batch) -> Sums:
     """The losses of the second look on the detector's own boxes, which have no gradient, as sums over the batch.
 
     ``refined_class`` is the cross-entropy of all boxes, ``refined_box`` the L1 distance of the residuals of boxes
     near an object.
     """
+    with jax.named_scope("refine"):
+        return look_sums(detector.config, variables, *look_samples(detector, outputs, inputs, batch))
+
+
+def look_samples(
+    detector: "Detector", outputs: Any, inputs: Any, batch: Batch
+) -> tuple[tuple[Array, Array, Array], RefinementTargets]:
+    """Inputs of the second look for the detector's boxes of a batch, and their targets; without gradient."""
     config, refinement = detector.config, _config_of(detector.config)
     inference = proposal_inference(config)
 
@@ -181,14 +182,18 @@ def refinement_sums(
         )
         return look_inputs(config, one.points, one.valid, boxes), targets
 
-    with jax.named_scope("refine"):
-        samples = lax.stop_gradient((outputs, inputs, batch))
-        looked, targets = over_samples(prepared, samples)
-        logits, residual = look(network, variables, looked)
-        entropy = jax.vmap(cross_entropy)(logits, targets.label)
-        distance = jnp.abs(residual - targets.residual).sum(axis=-1)
-        used = targets.weight > 0
-        right = (logits.argmax(axis=-1) == targets.label) & used
+    return over_samples(prepared, lax.stop_gradient((outputs, inputs, batch)))
+
+
+def look_sums(
+    config: Config, variables: Any, looked: tuple[Array, Array, Array], targets: RefinementTargets
+) -> Sums:
+    """The losses of the second look on boxes of several clouds, from the results of :func:`look_samples`."""
+    logits, residual = look(make_network(config), variables, looked)
+    entropy = jax.vmap(cross_entropy)(logits, targets.label)
+    distance = jnp.abs(residual - targets.residual).sum(axis=-1)
+    used = targets.weight > 0
+    right = (logits.argmax(axis=-1) == targets.label) & used
     losses = {
         "refined_boxes": {"refined_class": (entropy * targets.weight).sum()},
         "refined_near": {"refined_box": jnp.where(targets.near, distance, 0.0).sum()},

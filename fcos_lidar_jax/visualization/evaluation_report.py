@@ -11,7 +11,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.examples import sensor_boxes
-from fcos_lidar_jax.evaluation.kitti import TABLE_HEAD, object_counts
+from fcos_lidar_jax.evaluation.kitti import TABLE_HEAD, table_rows
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes
@@ -132,13 +132,8 @@ def _kitti_table(file: Path) -> list[tuple[str, tuple[str, ...], list[tuple[Cell
         return []
     metrics = json.loads(file.read_text())
     rows = [
-        (
-            f"{name}, {kind}",
-            *(float("nan") if value is None else value for value in scores[kind].values()),
-            object_counts(scores),
-        )
-        for name, scores in metrics["classes"].items()
-        for kind in ("bev", "3d")
+        (f"{name}, {kind}", *(float("nan") if value is None else value for value in values), counts)
+        for name, kind, values, counts in table_rows(metrics)
     ]
     head = f"KITTI's metric: AP_R40 in percent, on {metrics['num_frames']} frames"
     return [(head, ("class", *TABLE_HEAD), rows)]

@@ -1,4 +1,4 @@
-"""``--backend openvino``, and the export of the network as an ONNX graph."""
+"""``--backend openvino``, and the export as ONNX graphs."""
 
 import json
 import re
@@ -61,9 +61,10 @@ def test_evaluate_accepts_the_backend(home, tmp_path):
     assert json.loads((tmp_path / "metrics_summary.json").read_text())["mean_ap"] >= 0
 
 
-def test_export_writes_the_graph(home, tmp_path, capsys):
+@pytest.mark.parametrize("part", ["--network-only", ""])
+def test_export_writes_the_graph(home, tmp_path, capsys, part):
     for name in "ab":
-        options = "export --network-only --format onnx --checkpoint", home / "checkpoint", "--out"
+        options = f"export {part} --format onnx --checkpoint", home / "checkpoint", "--out"
         command(*options, tmp_path / f"{name}.onnx")
     assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
     onnx.checker.check_model(tmp_path / "a.onnx", full_check=True)

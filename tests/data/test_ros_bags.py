@@ -289,6 +289,10 @@ def test_clouds_outside_the_poses_are_skipped_with_a_note(tmp_path):
     drive = ros_bag_drive(bag, TINY, odometry="/odom")
     assert [sweep.name[-1] for sweep in drive.sweeps] == ["1", "2"]
     assert drive.notes == ["2 clouds before the first or after the last pose were skipped"]
+    drive = ros_bag_drive(bag, TINY, odometry="/odom", max_points=0)
+    with refused("/points: message 1: got "):  # the first is outside
+        list(drive.sweeps)
+    assert drive.notes == ["1 clouds before the first or after the last pose were skipped"]
     bag = write_recording(tmp_path / "b", "mcap", lambda make: drive_content(make, lambda make: poses(make)[:1]))
     with refused("/points: message 0: /odom: at 1700000000.173456 s: a gap in the poses"):
         list(ros_bag_drive(bag, TINY, odometry="/odom").sweeps)

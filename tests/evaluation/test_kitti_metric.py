@@ -5,7 +5,7 @@ import pytest
 from kitti_oracle import overlap, score
 from refusal import refused
 
-from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, describe_kitti, evaluate_kitti, overlaps
+from fcos_lidar_jax.evaluation.kitti import KINDS, MIN_OVERLAP, describe_kitti, evaluate_kitti, overlaps
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 SIZES = {"Pedestrian": (1.7, 0.6, 0.8), "Person_sitting": (1.3, 0.6, 0.8), "Cyclist": (1.7, 0.6, 1.8)}
@@ -13,11 +13,20 @@ NUMBER = 50
 """Objects in the cases by hand: more than the 41 positions."""
 
 
-def line(kind="Car", x=0.0, *, score=None, high=50.0, occlusion=0, truncation=0.0, z=20.0, y=1.7, ry=0.0) -> str:
+def line(
+    kind="Car", x=0.0, *, score=None, high=50.0, occlusion=0, truncation=0.0, alpha=0.0, wide=50.0, **at
+) -> str:
+    """A line of a file; the box in the image moves by 100 pixels per metre."""
     h, w, l = SIZES.get(kind, (1.5, 1.6, 4.0))
-    ending = "" if score is None else f" {score!r}"
-    pixels = f"100 100 150 {100 + high!r}"
-    return f"{kind} {truncation} {occlusion} 0 {pixels} {h} {w} {l} {x!r} {y!r} {z!r} {ry!r}{ending}\n"
+    y, z, ry = ({"y": 1.7, "z": 20.0, "ry": 0.0} | at).values()
+    ending, left = "" if score is None else f" {score!r}", 600 + 100 * x
+    pixels = f"{left!r} 100 {left + wide!r} {100 + high!r}"
+    return f"{kind} {truncation} {occlusion} {alpha!r} {pixels} {h} {w} {l} {x!r} {y!r} {z!r} {ry!r}{ending}\n"
+
+
+def region(left=0.0, right=2000.0, top=0.0, bottom=2000.0) -> str:
+    """A line of a DontCare region."""
+    return f"DontCare -1 -1 -10 {left!r} {top!r} {right!r} {bottom!r} -1 -1 -1 -1000 -1000 -1000 -10\n"
 
 
 def evaluate_texts(tmp_path, texts, **options):
@@ -33,7 +42,8 @@ def evaluate_texts(tmp_path, texts, **options):
 
 
 def random_frame(rng, *, plain=False):
-    """Objects in clumps, and detections near them: equal ones, equal scores, other classes, limits met exactly.
+    """Objects in clumps, and detections near them: equal ones, equal scores, other classes, limits met exactly;
+    and regions.
 
     In plain frames most are cars that count, so that there are more objects than positions.
     """
@@ -47,15 +57,19 @@ def random_frame(rng, *, plain=False):
         if plain and rng.random() < 0.8:
             kind, limits = "Car", {}
         for _ in range(rng.choice([1, 1, 2])):
-            truths.append(line(kind, **place, **limits))
+            truths.append(line(kind, **place, **limits, alpha=float(rng.uniform(-4, 4))))
             place["x"] += 0.15
         for _ in range(rng.integers(0, 5)):
             guess = kind if rng.random() < 0.8 else str(rng.choice(TYPES))
             near = {name: float(v + rng.normal(0, 0.08)) for name, v in place.items()}
             high = float(rng.choice([20, 24.99, 25, 39.99, 40, 60]))
-            text = line(guess, **near, score=float(rng.random().__round__(rng.choice([1, 6]))), high=high)
+            score = float(rng.random().__round__(rng.choice([1, 6])))
+            text = line(guess, **near, score=score, high=high, alpha=float(rng.uniform(-4, 4)))
             found += [text] * rng.choice([1, 1, 2])
-    truths += ["DontCare -1 -1 -10 0 0 2000 2000 -1 -1 -1 -1000 -1000 -1000 -10\n"] * rng.integers(0, 2)
+    for left, wide, top, bottom in rng.uniform(
+        (-1500, 0, 90, 120), (2500, 1000, 115, 170), (rng.integers(0, 4), 4)
+    ).tolist():
+        truths.append(region(left, left + wide, top, bottom))
     rng.shuffle(truths)
     rng.shuffle(found)
     return "".join(truths), "".join(found)
@@ -66,7 +80,9 @@ def deviation_from_oracle(tmp_path, seed):
     texts = [random_frame(rng, plain=plain) for _ in range(rng.integers(20, 50) if plain else rng.integers(1, 20))]
     summary, largest = evaluate_texts(tmp_path, texts), 0.0
     assert summary["num_frames"] == len(texts)
-    for (name, metric, difficulty), (number, percent) in score(texts).items():
+    expected = score(texts)
+    assert {metric for _, metric, _ in expected} == {*KINDS}
+    for (name, metric, difficulty), (number, percent) in expected.items():
         ours = summary["classes"][name.capitalize()]
         assert ours["num_truth"][difficulty] == number
         value = ours[metric][difficulty]
@@ -107,7 +123,7 @@ def all_of(value):
     return pytest.approx(dict.fromkeys(("easy", "moderate", "hard"), value))
 
 
-@pytest.mark.parametrize("metric", ["bev", "3d"])
+@pytest.mark.parametrize("metric", KINDS)
 @pytest.mark.parametrize("name", MIN_OVERLAP)
 def test_perfect_one_missing_and_one_too_many(tmp_path, name, metric):
     truths, found, where = street(name), street(name, score=0.8), (name, metric)
@@ -130,10 +146,10 @@ def test_few_objects_stay_below_100_as_in_the_development_kit(tmp_path):
 def test_the_table_counts_the_objects_of_each_difficulty(tmp_path):
     cars = [line("Car", 0.0), *(line("Car", 6.0 * i, high=30) for i in range(1, 4)), line("Van", 30.0)]
     summary = evaluate_texts(tmp_path, [("".join(cars), "")], classes=["Car", "Cyclist"])
-    head, bev, *_, cyclist = describe_kitti(summary).splitlines()[:5]
+    head, bev, *_, cyclist = describe_kitti(summary).splitlines()[:9]
     assert head.endswith("     hard objects: easy / moderate / hard")
     assert " ".join(bev.split()) == "Car 0.7 bev 0.00 0.00 0.00 1 / 4 / 4"
-    assert " ".join(cyclist.split()) == "Cyclist 0.5 3d - - - 0 / 0 / 0"
+    assert " ".join(cyclist.split()) == "Cyclist 0.5 aos - - - 0 / 0 / 0"
     assert len(head) == len(bev) == len(cyclist)
     unseen = evaluate_texts(tmp_path, [(line(high=0), line(score=0.5))])  # labels without boxes in the image
     assert "no object is evaluated: the difficulty needs labels with boxes in the" in describe_kitti(unseen)
@@ -154,6 +170,32 @@ def test_an_overlap_must_exceed_the_least_and_space_counts_the_height(tmp_path):
         found = [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in found]
         assert ap(tmp_path, truths, found, "Pedestrian") == all_of(space)
         assert ap(tmp_path, truths, found, "Pedestrian", "bev") == all_of(100)
+
+
+PEDESTRIANS = street("Pedestrian", score=0.8)
+FALSE = line("Pedestrian", 3.0, score=0.9)  # its left side is 900
+IMAGE = {  # detections of fifty pedestrians, another line of the labels -> percent of image boxes and orientations
+    "off by 90 degrees": (street("Pedestrian", score=0.8, alpha=np.pi / 2), "", 100, 50),
+    "off by 180 degrees": (street("Pedestrian", score=0.8, alpha=-np.pi), "", 100, 0),
+    "half of the box": (street("Pedestrian", score=0.8, wide=25.0), "", 0, 0),
+    "more than half": (street("Pedestrian", score=0.8, wide=25.1), "", 100, 100),
+    "a false one": ([*PEDESTRIANS, FALSE], "", 100 * 50 / 51, 100 * 50 / 51),
+    "in a region": ([*PEDESTRIANS, FALSE], region(), 100, 100),
+    "half in a region": ([*PEDESTRIANS, FALSE], region(right=925.0), 100 * 50 / 51, 100 * 50 / 51),
+    "more than half in a region": ([*PEDESTRIANS, FALSE], region(right=925.1), 100, 100),
+    "no angle": ([*PEDESTRIANS, FALSE.replace("0.0 0 0.0", "0.0 0 -10")], "", 100 * 50 / 51, None),
+    "no image boxes": ([PEDESTRIANS[0].replace("600.0 100 650.0 150.0", "-1 -1 -1 -1")], "", None, None),
+}
+
+
+@pytest.mark.parametrize("case", IMAGE)
+def test_image_boxes_and_orientation(tmp_path, case):
+    found, more, *percents = IMAGE[case]
+    texts = [("".join([*street("Pedestrian"), more]), "".join(found))]
+    scores = evaluate_texts(tmp_path, texts)["classes"]["Pedestrian"]
+    assert [*map(scores.get, ("image", "aos"))] == [None if each is None else all_of(each) for each in percents]
+    if len(found) > NUMBER:  # regions excuse in the image only
+        assert scores["bev"] == scores["3d"] == all_of(100 * 50 / 51)
 
 
 def test_the_score_decides_first_and_the_overlap_then(tmp_path):
@@ -185,7 +227,11 @@ ODD_RESULTS = {  # what changes in fifty perfect detections: the moderate AP of 
         lambda rows: [line("Person", score=0.9, high=20.0), *rows],
         *(97.5, "skipped, none of KITTI's types: 1 Person"),
     ),
-    "image only": (lambda rows: [*rows, FLAT], 100 * 50 / 51, "without a box in 3D, and therefore false: 1 det"),
+    "image only": (
+        lambda rows: [*rows, FLAT],
+        100 * 50 / 51,
+        "without a box in 3D, and therefore false in bev and 3d: 1 ",
+    ),
     "image only, of no type": (
         lambda rows: [*rows, FLAT.replace("Car", "Bicycle"), FLAT.replace("Car", "DontCare")],
         *(100.0, "skipped, none of KITTI's types: 1 Bicycle"),
@@ -206,7 +252,7 @@ def test_results_are_read_as_by_the_development_kit(tmp_path, case):
     assert summary["classes"]["Car"]["3d"]["moderate"] == pytest.approx(percent)
     expected = score([(label, result)])
     assert expected["car", "3d", "moderate"][1] == pytest.approx(percent)
-    lines = describe_kitti(summary).splitlines()[7:]
+    lines = [text for text in describe_kitti(summary).splitlines()[1:] if not text.startswith((*MIN_OVERLAP,))]
     assert [text.startswith(told) for text in lines] == [True] * bool(told)
 
 

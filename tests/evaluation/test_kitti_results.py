@@ -117,12 +117,21 @@ CARS = [(x, y, -0.9, 4.0, 1.7, 1.5, 0.1) for x in (10.0, 15.0, 20.0) for y in (-
 """Higher than 40 pixels. Six frames of them are more than the 41 positions."""
 
 
+def in_the_image(text):
+    """A label with its alpha and its box in the image."""
+    words = text.split()
+    camera = np.array([[float(word) for word in words[8:15]]])
+    words[3] = str(camera[0, 6] - np.arctan2(camera[0, 3], camera[0, 5]))
+    words[4:8] = [str(pixel) for pixel in image_boxes(camera, P2, IMAGE_SIZE)[0][0].tolist()]
+    return " ".join(words) + "\n"
+
+
 @pytest.fixture
 def root(tmp_path):
     """Six frames of cars, with a pedestrian and an area without labels."""
     root = tmp_path / "kitti"
     walker = label_text((11.0, -2.0, -0.8, 0.6, 0.7, 1.8, -2.0), "Pedestrian")
-    labels = ("".join(map(label_text, CARS)) + walker).replace("1.0 2.0 3.0 4.0", "100 100 200 200")
+    labels = "".join(in_the_image(text) for text in (*map(label_text, CARS), walker))
     labels += "DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"
     for i in range(6):
         write(root / "training" / "calib" / f"00000{i}.txt", calibration_text())
@@ -150,6 +159,7 @@ def test_the_metric_of_what_was_written(root, tmp_path):
     assert json.loads((out / "metrics_kitti.json").read_text()) == metrics
     car = metrics["classes"]["Car"]
     assert (car["num_truth"]["hard"], car["bev"]["easy"], car["3d"]["hard"]) == (54, 100.0, 100.0)
+    assert (car["image"]["moderate"], car["aos"]["moderate"]) == pytest.approx((100.0, 100.0))
     assert (metrics["num_frames"], metrics["left_out"]) == (6, ["Truck", "Cyclist"])
     assert sorted(f.name for f in (out / "results_kitti").iterdir()) == [f"00000{i}.txt" for i in range(6)]
     assert "left out, not in both the detector and KITTI's metric: Truck, Cyclist" in describe_kitti(metrics)
@@ -197,6 +207,7 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     ((_, header, rows),) = evaluation_report._kitti_table(tmp_path / "out" / "metrics_kitti.json")
     assert header == ("class", "easy", "moderate", "hard", "objects: easy / moderate / hard")
     assert rows[1] == ("Car, 3d", 100.0, 100.0, 100.0, "54 / 54 / 54")
+    assert [name for name, *_ in rows[2:4]] == ["Car, image", "Car, aos"]
     assert evaluation_report._kitti_table(tmp_path / "none.json") == []
     printed = capsys.readouterr().out
     assert "KITTI AP_R40 on 6 frames" in printed

@@ -11,6 +11,7 @@ from experiments.changes import SLIM
 from experiments.studies import ladder
 from experiments.studies.ladder import BASE, MARKED, SENSOR, TRIALS, Args, Marked, measure
 from fcos_lidar_jax.data.box_geometry import inside_box
+from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import COMPACT
 from fcos_lidar_jax.projection import project_points
@@ -40,7 +41,7 @@ def test_every_trial_is_a_network_for_the_sector(name):
     parameters = count_parameters(jax.eval_shape(detector.init, jax.random.key(0))["params"])["total"]
     assert parameters == PARAMETERS[name]
     assert (config == BASE(SLIM(COMPACT))) == (name == "local geometry")
-    assert config.optimizer == COMPACT.optimizer
+    assert (config.optimizer == COMPACT.optimizer) == (name not in ladder.AFTERWARDS)
 
 
 @pytest.fixture
@@ -53,21 +54,33 @@ def _linear():
 @pytest.mark.usefixtures("_linear")
 def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys):
     """Two steps on two frames with a linear network: that everything is there, not what it is."""
-    for name, value in (("TRAIN_FRAMES", 2), ("TEST_FRAMES", 2), ("CURVE_FRAMES", 1)):
+    for name, value in (("TRAIN_FRAMES", 2), ("TEST_FRAMES", 2), ("CURVE_FRAMES", 1), ("UPDATES", 2)):
         monkeypatch.setattr(ladder, name, value)
     out = tmp_path / "ladder.json"
-    args = Args(trials=("local geometry",), steps=2, work=tmp_path, out=out)
+    args = Args(trials=("larger", "larger, looked at again"), steps=2, work=tmp_path, out=out)
     measure(args)
-    (row,) = json.loads(out.read_text())["rows"]
-    assert (row["trial"], row["seed"], len(row["curve"])) == ("local geometry", 0, 2)
-    assert 0 <= row["mAP"] <= 1
-    assert row["step_s"] > 0
-    shapes = jax.eval_shape(build_detector(BASE(SLIM(COMPACT)), SENSOR).init, jax.random.key(0))
-    assert row["parameters"] == sum(leaf.size for leaf in jax.tree.leaves(shapes["params"]))
-    assert '"trial": "local geometry"' in capsys.readouterr().out
+    rows = json.loads(out.read_text())["rows"]
+    assert [(row["trial"], row["seed"], len(row["curve"])) for row in rows] == [
+        ("larger", 0, 2),
+        ("larger, looked at again", 0, 0),
+    ]
+    for row in rows:
+        assert 0 <= row["mAP"] <= 1
+        assert row["step_s"] > 0
+        shapes = jax.eval_shape(
+            build_detector(TRIALS[row["trial"]](BASE(SLIM(COMPACT))), SENSOR).init, jax.random.key(0)
+        )
+        assert row["parameters"] == sum(leaf.size for leaf in jax.tree.leaves(shapes["params"]))
+    first, after = (
+        load_trained(tmp_path / name).variables["params"] for name in ("larger_2_0", "larger_looked_at_again_2_0")
+    )
+    look = after.pop("refinement")
+    jax.tree.map(np.testing.assert_array_equal, first, after)  # frozen
+    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(look))  # with biases that were zero
+    assert '"trial": "larger"' in capsys.readouterr().out
     monkeypatch.setattr(ladder, "trial", None)  # nothing is trained again
     measure(args)
-    assert capsys.readouterr().out.count("| local geometry | 2 |") == 2  # in both tables
+    assert capsys.readouterr().out.count("| larger | 2 |") == 2  # in both tables
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.refinement.network import SecondLook
 from fcos_lidar_jax.refinement.stage import best_boxes, refinement_sums, trainable
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step, plan
 from fcos_lidar_jax.training.step import make_gradient
@@ -126,7 +125,7 @@ def test_a_frozen_detector_is_not_changed():
 def test_losses_equal_sums_over_the_samples():
     """Two samples are processed in a loop, one sample without it."""
     model, variables = detector("FCOS-LiDAR", SMALL)  # of whose network nothing is asked
-    network, batch = SecondLook(10, SMALL.point_channels, SMALL.box_channels), host_batch()
+    batch = host_batch()
     boxes = jnp.concatenate([batch.boxes[0, :4], batch.boxes[1, :3] + 0.3]), jnp.linspace(0.9, 0.1, 7)
     labels = jnp.concatenate([batch.labels[0, :4], batch.labels[1, :3]])
     model = model._replace(candidates=lambda outputs, image: (*boxes, labels, jnp.ones(7, bool)))
@@ -134,7 +133,7 @@ def test_losses_equal_sums_over_the_samples():
     @jax.jit
     def sums(batch):
         nothing = jnp.zeros((len(batch.points), 1))
-        return refinement_sums(model, network, variables, nothing, nothing, batch)
+        return refinement_sums(model, variables, nothing, nothing, batch)
 
     whole = sums(batch)
     parts = [sums(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], batch)) for i in range(2)]

@@ -6,6 +6,7 @@ from shapely import Polygon
 
 OVERLAP = {"car": 0.7, "pedestrian": 0.5, "cyclist": 0.5}
 NEIGHBOUR = {"car": "van", "pedestrian": "person_sitting", "cyclist": None}
+METRICS = ("bev", "3d", "image", "aos")
 LIMITS = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.3), "hard": (25, 2, 0.5)}
 
 
@@ -23,7 +24,20 @@ def footprint(o):
     return Polygon([(o["x"] + c * a + s * b, o["z"] - s * a + c * b) for a, b in corners])
 
 
+def shared_pixels(a, b):
+    wide = min(a["right"], b["right"]) - max(a["left"], b["left"])
+    high = min(a["bottom"], b["bottom"]) - max(a["top"], b["top"])
+    return wide * high if wide > 0 and high > 0 else 0.0
+
+
+def pixels(o):
+    return (o["right"] - o["left"]) * (o["bottom"] - o["top"])
+
+
 def overlap(a, b, metric):
+    if metric in ("image", "aos"):
+        shared = shared_pixels(a, b)
+        return shared / (pixels(a) + pixels(b) - shared) if shared else 0.0
     p, q = footprint(a), footprint(b)
     shared = p.intersection(q).area
     if metric == "bev":
@@ -51,10 +65,16 @@ def detection_state(o, name, difficulty):
     return 0 if o["type"] == name else -1
 
 
-def match(truths, found, shared, states, least, threshold=None):
-    """Scores of the true positives, and the number of false ones; the first pass has no threshold."""
+def in_dont_care(detection, truths, least):
+    areas = [o for o in truths if o["type"] == "dontcare"]
+    return any(shared_pixels(detection, area) > least * pixels(detection) for area in areas)
+
+
+def match(truths, found, shared, states, least, metric, threshold=None):
+    """Pairs of scores and similarities of the true positives, and the number of false ones; the first pass has no
+    threshold."""
     truth_states, found_states = states
-    taken, scores = set(), []
+    taken, hits = set(), []
     present = [threshold is None or o["score"] >= threshold for o in found]
     for i in range(len(truths)):
         if truth_states[i] == -1:
@@ -73,9 +93,14 @@ def match(truths, found, shared, states, least, threshold=None):
             continue
         taken.add(best)
         if truth_states[i] == 0 and found_states[best] == 0:
-            scores.append(found[best]["score"])
-    false = sum(found_states[j] == 0 and present[j] and j not in taken for j in range(len(found)))
-    return scores, false
+            similarity = (1 + math.cos(truths[i]["alpha"] - found[best]["alpha"])) / 2
+            hits.append((found[best]["score"], similarity if metric == "aos" else 1))
+    false = 0
+    for j in range(len(found)):
+        if found_states[j] == 0 and present[j] and j not in taken:
+            excused = metric in ("image", "aos") and in_dont_care(found[j], truths, least)
+            false += not excused
+    return hits, false
 
 
 def scores_at_positions(scores, number):
@@ -103,14 +128,16 @@ def average_precision(frames, name, difficulty, metric):
     number = sum(truth.count(0) for truth, _ in states)
     least, all_scores = OVERLAP[name], []
     for (truths, found, shared), state in zip(frames, states, strict=True):
-        all_scores += match(truths, found, shared[metric], state, least)[0]
+        hits, _ = match(truths, found, shared[metric], state, least, metric)
+        all_scores += [score for score, _ in hits]
     precision = [0.0] * 41
     for k, threshold in enumerate(scores_at_positions(all_scores, number) if number else []):
-        true = false = 0
+        true = false = worth = 0
         for (truths, found, shared), state in zip(frames, states, strict=True):
-            scores, wrong = match(truths, found, shared[metric], state, least, threshold)
-            true, false = true + len(scores), false + wrong
-        precision[k] = true / (true + false) if true + false else 0.0
+            hits, wrong = match(truths, found, shared[metric], state, least, metric, threshold)
+            true, false = true + len(hits), false + wrong
+            worth += sum(similarity for _, similarity in hits)
+        precision[k] = worth / (true + false) if true + false else 0.0
     return number, sum(max(precision[k:]) for k in range(1, 41)) / 40 * 100
 
 
@@ -119,7 +146,9 @@ def score(texts):
     frames = []
     for label, result in texts:
         truths, found = read(label), read(result)
-        shared = {m: [[overlap(t, d, m) for d in found] for t in truths] for m in ("bev", "3d")}
+        shared = {m: [[overlap(t, d, m) for d in found] for t in truths] for m in METRICS}
         frames.append((truths, found, shared))
-    kinds = ((n, m, d) for n in OVERLAP for m in ("bev", "3d") for d in LIMITS)
+    detections = [o for _, found, _ in frames for o in found]
+    metrics = [m for m in METRICS if m != "aos" or all(o["alpha"] != -10 for o in detections)]
+    kinds = ((n, m, d) for n in OVERLAP for m in metrics for d in LIMITS)
     return {(n, m, d): average_precision(frames, n, d, m) for n, m, d in kinds}
