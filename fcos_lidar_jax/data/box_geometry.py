@@ -6,7 +6,7 @@ import numpy as np
 
 from fcos_lidar_jax.geometry import points_in_box
 
-LIMITS = dict.fromkeys("xyz", 1e4) | dict.fromkeys("lwh", 500.0) | {"yaw": 4 * np.pi, "vx": 500.0, "vy": 500.0}
+LIMITS = dict.fromkeys("xyz", 1e4) | dict.fromkeys("lwh", 500.0) | {"yaw": 8 * np.pi, "vx": 500.0, "vy": 500.0}
 """Field of a box -> largest plausible magnitude: metres, radians (larger yaws are degrees), metres per second."""
 _CELL_M = 0.5
 _MAX_CELLS = 1024  # per side: a box far away makes the cells larger instead of the grid

@@ -19,7 +19,7 @@ CAR = dict(zip(LIMITS, (8, 1, -1, 4, 2, 1.5, 0.25, 1.5, -0.5), strict=True))
         ({"vx": np.inf}, "vx: got inf, expected a finite number"),
         ({"vy": np.nan}, "vy: got nan, expected a finite number"),  # a velocity is unknown as a whole
         ({"z": 1e30}, "z: got 1e+30, expected at most 10000"),
-        ({"yaw": 90}, "yaw: got 90, expected at most 12.5664 radians"),  # degrees
+        ({"yaw": 90}, "yaw: got 90, expected at most 25.1327 radians"),  # degrees
         ({"l": 501}, "l: got 501, expected at most 500"),
         ({"vx": -501}, "vx: got -501, expected at most 500"),
         ({"w": -2}, "w: got -2, expected a size above 0 m"),

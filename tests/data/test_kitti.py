@@ -203,7 +203,7 @@ BAD = {
         re.sub("6.060*e[+]02", "960", calibration_text()),
         "P2: got a principal point of [960.0, 178.0]",
     ),
-    "degrees": (L, label(ry="-90"), "line 2: yaw: got -90, expected at most 12.5664 radians"),
+    "degrees": (L, label(ry="-90"), "line 2: yaw: got -90, expected at most 25.1327 radians"),
     "unknown frame": (S, "000007\n../label_2/000007\n", "line 2: got '../label_2/000007', expected the name of"),
     "frame twice": (S, "000007\n\n000007\n", "line 3: got '000007' a second time"),
     "empty split": (S, "\n", "no frame in it, expected at least one"),
