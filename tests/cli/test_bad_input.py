@@ -37,7 +37,7 @@ def home(tmp_path_factory):
     (folder / "labels").mkdir()
     (folder / "labels" / "0.txt").write_text("Car 0.00 0 0.1 10 20 30 40 1.5 1.6 3.9 1 2 9 0.2\n")
     entry = {"sensor_to_world": np.eye(4).tolist()}
-    poses = [{**entry, "file": f"training/velodyne/{i}.npy", "timestamp_us": i} for i in (1, 0)]
+    poses = [{**entry, "file": f"training/velodyne/{i}.npy", "timestamp_us": 50_000 * i} for i in (1, 0)]
     (folder / "poses.json").write_text(json.dumps(poses))
     (folder / "truth.json").write_text("{}")
     (folder / "results_nusc.json").write_text("{}")
