@@ -65,6 +65,7 @@ def look_again(
 def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: int, seed: int) -> Any:
     """What the second look sees in each sample, and its targets, stacked."""
     detector = build_detector(config, first.sensor)
+    assert config.augment is not None  # as in all trials
     augment_one = functools.partial(augment, config=config.augment, origin_m=first.sensor.origin_m)
 
     @jax.jit

@@ -601,8 +601,9 @@ def test_single_sweeps_are_reported_if_several_are_configured(tmp_path, capsys):
 
 def test_boxes_without_points_are_reported(tmp_path, capsys):
     frames = [FRAMES.frame(i) for i in range(4)]
-    empty = [dataclasses.replace(frame, num_points=0 * frame.num_points) for frame in frames[1:]]
-    train_tiny(tmp_path / "run", frames=InMemoryFrames((frames[0], *empty), FRAMES.sensor, FRAMES.classes), steps=1)
+    others = [dataclasses.replace(frame, num_points=0 * frame.num_points) for frame in frames[1:]]
+    own = InMemoryFrames((frames[0], *others), FRAMES.sensor, FRAMES.classes)
+    train_tiny(tmp_path / "run", frames=own, steps=1)
     assert "contain no point and are not learned: are points and boxes in the same" in capsys.readouterr().err
 
 
