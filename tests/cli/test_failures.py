@@ -230,12 +230,14 @@ def test_helps_and_errors_are_shown_on_a_terminal_without_unicode(variables):
 
 
 @pytest.mark.slow
-def test_a_closed_output_pipe_ends_in_silence():
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_closed_output_pipe_ends_in_silence(unbuffered):
     read, write = os.pipe()
     os.close(read)
     words = [sys.executable, "-m", "fcos_lidar_jax", "--help"]
     streams = {"stdout": write, "stderr": subprocess.PIPE, "text": True}
-    done = subprocess.run(words, env=child_environment(), check=False, **streams)
+    environment = child_environment(PYTHONUNBUFFERED=unbuffered)
+    done = subprocess.run(words, env=environment, check=False, **streams)
     os.close(write)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
 

@@ -86,9 +86,12 @@ def test_frames_without_usable_points_of_other_processes_are_counted(monkeypatch
     assert "the first is toy 0: no usable points\n" in told
 
 
-@pytest.mark.parametrize(("options", "again"), [(None, [0, 2, 3]), ([0.5], [0, 1, 2, 3])])
+@pytest.mark.parametrize(
+    ("options", "clouds", "again"),
+    [(None, "a", [0, 2, 3]), ([0.5], "a", [0, 1, 2, 3]), (None, "changed", [0, 1, 2, 3])],
+)
 def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_before(
-    monkeypatch, tmp_path, capsys, options, again
+    monkeypatch, tmp_path, capsys, options, clouds, again
 ):
     detected, written = [], []
 
@@ -109,8 +112,10 @@ def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_
         results.write_predictions(load_detector("quickstart"), ToyFrames(size=4), tmp_path / "x.json", **how)
 
     monkeypatch.setattr(results, "predict", predict)
+    monkeypatch.setattr(ToyFrames, "clouds_fingerprint", lambda *_: "a")
     with pytest.raises(KeyboardInterrupt):
         run()
+    monkeypatch.setattr(ToyFrames, "clouds_fingerprint", lambda *_: clouds)
     run(options=options)
     assert detected == [0, 1, "interrupted", *again]
     assert written == [(f"toy {i}", b'[{"index": %d}]' % i) for i in range(4)]
