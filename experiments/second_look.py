@@ -1,7 +1,7 @@
 """The second look trained on the boxes of a frozen detector, which are found only once per frame.
 
-``train --weights`` with ``refinement.freeze_detector`` runs the detector in each step. Here an update, which costs
-a tenth of such a step, sees four frames, and a frame is used several times.
+``train --weights`` with ``refinement.freeze_detector`` runs the detector in each step. Here each update sees four
+frames whose boxes are in memory, and a frame is used several times.
 """
 
 import dataclasses

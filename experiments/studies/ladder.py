@@ -11,9 +11,10 @@ nuScenes' HDL-32E (32 x 272 pixels) with one sweep, and one round except in "sec
 frames of varied simulated streets, 3,000 steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on
 200 unseen frames, and on 60 of them after each quarter of the training. A second look (``refinement``) is trained
 in the same step ("joint"), or afterwards on the same frames ("looked at again"), with the first trial's weights
-frozen: 3,000 updates of four frames, in which the detector's boxes were found once.
+frozen: 3,000 updates of four frames, in which the detector's boxes were found once. The seconds per step of the
+latter are its whole time without the detector's training, divided by the steps.
 
-The same command resumes a trial. Trials that are already in the file of ``--out`` are not repeated: with
+The same command resumes a trial; a second look afterwards starts again. Trials that are already in the file of ``--out`` are not repeated: with
 ``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has
 an entry per question. Cost: half an hour of one core per trial, and some minutes once for the frames.
 """
