@@ -14,9 +14,10 @@ in the same step ("joint"), or afterwards on the same frames ("looked at again")
 frozen: 3,000 updates of four frames, in which the detector's boxes were found once. The seconds per step of the
 latter are its whole time without the detector's training, divided by the steps.
 
-The same command resumes a trial; a second look afterwards starts again. Trials that are already in the file of ``--out`` are not repeated: with
-``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has
-an entry per question. Cost: half an hour of one core per trial, and some minutes once for the frames.
+The same command resumes a trial; a second look afterwards starts again. Trials that are already in the file of
+``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the committed
+trials. ``experiments/LOG.md`` has an entry per question. Cost: half an hour of one core per trial, and some
+minutes once for the frames.
 """
 
 import dataclasses
