@@ -128,13 +128,19 @@ vehicle. NMS at 0.1, weighted NMS, the IoU exponent, the regression axes and the
 KITTI_COMPACT = dataclasses.replace(
     KITTI,
     name="kitti_compact",
+    sensor="kitti_camera",
     refinement=None,
     **{part: getattr(COMPACT, part) for part in ("projection", "loss", "inference", "optimizer")},
     model=dataclasses.replace(
-        COMPACT.model, channel_mean=KITTI.model.channel_mean, channel_scale=KITTI.model.channel_scale
+        COMPACT.model,
+        circular_width=False,
+        channel_mean=KITTI.model.channel_mean,
+        channel_scale=KITTI.model.channel_scale,
     ),
+    # The camera sees 81 degrees, the image has 90.
+    augment=AugmentConfig(flip_x_probability=0.0, max_rotation_rad=math.radians(4)),
 )
-"""The network, losses and post-processing of ``compact`` for KITTI. No weights have been trained with it."""
+"""The network, losses and post-processing of ``compact`` for KITTI's camera view, a quarter of the image."""
 
 CENTERPOINT_PILLARS = CenterPointConfig.of(
     NUSCENES,

@@ -171,6 +171,9 @@ KITTI_HDL64E = Sensor(
 )
 """KITTI's HDL-64E, nominal beam table; intensity in the files is 0-1."""
 
+KITTI_CAMERA = dataclasses.replace(sector(KITTI_HDL64E, 0.0, 512), name="kitti_camera")
+"""The quarter turn ahead, which contains the view of KITTI's camera, where objects are labelled."""
+
 WAYMO_TOP = Sensor(
     "waymo_top",
     even_inclinations(-17.6, 2.4, 64),
@@ -218,7 +221,7 @@ TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, **_SIMULATED)
 SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 128, **_SIMULATED)
 """The quickstart's sensor: 32 beams, few columns, for short range."""
 
-_REAL = (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, VLP16, OS1_64, OS1_128, PANDAR64)
+_REAL = (NUSCENES_HDL32E, KITTI_HDL64E, KITTI_CAMERA, WAYMO_TOP, ARGOVERSE2, VLP16, OS1_64, OS1_128, PANDAR64)
 PRESETS: dict[str, Sensor] = {s.name: s for s in (*_REAL, TINY, SHORT_RANGE)}
 """Sensors by name."""
 

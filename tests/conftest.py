@@ -38,12 +38,9 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # a process 
 
 
 # Most of the time goes to compilation, so programs are compiled without optimisation, except where the last bits
-# matter: in exported programs and projection.
-_OPTIMISED = ("test_export", "test_projection")
-
-
-def _is_quick(path: Path) -> bool:
-    return path.stem not in _OPTIMISED
+# of the optimised program matter: marked ``optimised``.
+def _is_quick(item: pytest.Item) -> bool:
+    return item.get_closest_marker("optimised") is None
 
 
 _NETWORKS = ("centerpoint", "checkpoints", "inference", "models", "refinement", "training")
@@ -53,17 +50,19 @@ _NETWORKS = ("centerpoint", "checkpoints", "inference", "models", "refinement", 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Examples that compile networks are slow.
 
-    What is optimised comes first, for a change of the mode forgets all programs; short doctests come last.
+    Files with optimised programs come first, for a change of the mode forgets all programs; short doctests come
+    last.
     """
     for item in items:
         if isinstance(item, pytest.DoctestItem) and item.path.parent.name in _NETWORKS:
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: _is_quick(item.path))
+    optimised = {item.path for item in items if not _is_quick(item)}
+    items.sort(key=lambda item: item.path not in optimised)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _optimisation(request: pytest.FixtureRequest) -> None:
-    compile_quickly(_is_quick(request.path))
+@pytest.hookimpl(tryfirst=True)  # before fixtures compile anything
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    compile_quickly(_is_quick(item))
 
 
 # Where the question is which pictures there are, not how they look, they have a ninth of the pixels and no layout.

@@ -88,19 +88,13 @@ def test_only_compact_looks_at_its_boxes_again():
 
 
 def test_kitti_compact_has_the_data_of_kitti_and_the_network_of_compact():
-    of_data = (
-        "sensor",
-        "classes",
-        "max_points",
-        "max_boxes",
-        "class_balanced",
-        "num_sweeps",
-        "augment",
-        "copy_paste",
-    )
+    of_data = ("classes", "max_points", "max_boxes", "class_balanced", "num_sweeps", "copy_paste")
     assert [getattr(KITTI_COMPACT, name) for name in of_data] == [getattr(KITTI, name) for name in of_data]
     scaled = dataclasses.replace(
-        COMPACT.model, channel_mean=KITTI.model.channel_mean, channel_scale=KITTI.model.channel_scale
+        COMPACT.model,
+        circular_width=False,
+        channel_mean=KITTI.model.channel_mean,
+        channel_scale=KITTI.model.channel_scale,
     )
     assert KITTI_COMPACT.model == scaled
     assert (KITTI_COMPACT.optimizer, KITTI_COMPACT.inference) == (COMPACT.optimizer, COMPACT.inference)

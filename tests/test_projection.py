@@ -23,6 +23,8 @@ from fcos_lidar_jax.sensors import (
     sector,
 )
 
+pytestmark = pytest.mark.optimised
+
 SMALL = Sensor("small", even_inclinations(-20, 10, 4), 12)
 LASER = dataclasses.replace(SMALL, name="laser", row_source="laser", origin_m=(1.0, -2.0, 0.5))
 

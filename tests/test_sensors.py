@@ -31,6 +31,10 @@ def test_presets_match_the_paper_and_the_data_sheets():
     assert PRESETS["argoverse2"].point_columns == 6
     assert nuscenes.even_step_rad is not None
     assert PRESETS["kitti_hdl64e"].even_step_rad is None
+    camera = PRESETS["kitti_camera"]
+    assert camera.inclinations_rad == PRESETS["kitti_hdl64e"].inclinations_rad
+    assert camera.column_rad == PRESETS["kitti_hdl64e"].column_rad
+    assert camera.azimuth_limits_rad == (-math.pi / 4, math.pi / 4)
 
 
 @pytest.mark.parametrize(

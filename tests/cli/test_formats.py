@@ -94,7 +94,7 @@ def test_every_format_is_tried():
 @pytest.mark.slow
 @pytest.mark.parametrize("make", MAKERS)
 def test_prepares_trains_evaluates_and_detects(make, tmp_path, capsys):
-    """The network does not depend on the format; ``test_train.py`` trains FCOS-LiDAR's."""
+    """The network does not depend on the format; ``tests/training`` trains FCOS-LiDAR's."""
     with linear_network():
         prepare_train_evaluate_and_detect(make, tmp_path, capsys)
 

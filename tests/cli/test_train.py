@@ -54,9 +54,17 @@ def train(root: Path, out: Path, *more: str) -> list[str]:
     return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often, *tests, *more]
 
 
+@pytest.fixture
+def _linear():
+    """tests/training trains FCOS-LiDAR's network."""
+    with linear_network():
+        yield
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("_linear")
 def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys):
-    start, out = root.parent / "start", tmp_path / "run"
+    start, out = root.parent / "linear", tmp_path / "run"
     options = ["--samples", "1:2", "--copy-paste.min-points", "3", "--second-look", "on"]
     command(*train(root, out, "--weights", str(start), *options))
     record = json.loads(capsys.readouterr().out)
@@ -73,7 +81,8 @@ def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys)
     # Training started at the given weights: a step of AdamW moves a weight by the learning rate at most.
     trained = load_checkpoint(record["checkpoint"]).variables["params"]
     own = {name: part for name, part in trained.items() if name != "refinement"}
-    moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), own, weights()["params"])
+    given = load_checkpoint(start).variables["params"]
+    moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), own, given)
     reach = 1.1 * sum(line["learning_rate"] for line in lines if "learning_rate" in line)
     assert 0 < max(jax.tree.leaves(moved)) < reach
     cloud = next((root / "samples" / "LIDAR_TOP").iterdir())
@@ -264,6 +273,7 @@ def test_objects_of_more_sweeps_are_taken_and_their_frames_opened_once(root, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_linear")
 def test_a_refused_resume_leaves_the_objects_of_the_run(root, tmp_path, capsys):
     out = tmp_path / "run"
     command(*train(root, out, "--samples", "0:1", "--val-split", "none"))

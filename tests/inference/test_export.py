@@ -39,6 +39,7 @@ def home(tmp_path_factory):
     return folder
 
 
+@pytest.mark.optimised
 def test_boxes_are_bit_identical_to_the_checkpoint(home):
     trained, exported = (fcos.load_detector(home / name) for name in ("checkpoint", "detector.fcos"))
     clouds = [*(make_frame(seed, TINY).points for seed in range(3)), np.load(home / "cloud.npy")]
@@ -50,6 +51,15 @@ def test_boxes_are_bit_identical_to_the_checkpoint(home):
         assert exported(points).to_dict() == trained(points).to_dict()
     assert exported.classes == trained.classes
     assert exported.sensor == trained.sensor
+
+
+@pytest.mark.optimised
+def test_detect_accepts_an_exported_detector_with_its_batch_size(home, tmp_path, capsys):
+    for name in ("checkpoint", "detector.fcos"):
+        command("detect", home / "cloud.npy", "--checkpoint", home / name, "--out", tmp_path / f"{name}.json")
+    assert (tmp_path / "checkpoint.json").read_bytes() == (tmp_path / "detector.fcos.json").read_bytes()
+    words = ["detect", str(home / "cloud.npy"), "--checkpoint", str(home / "detector.fcos"), "--batch-size", "2"]
+    assert_one_line_error(capsys, [*words, "--out", str(tmp_path / "a")], r"batch size: got 2, expected 1")
 
 
 def test_the_program_cleans_raw_clouds(home):
@@ -137,14 +147,6 @@ def test_the_documented_code_runs_without_this_package(home):
     lines = [line for line in ran.stdout.splitlines() if line[:1].isalpha()]
     assert [line.split()[0] for line in lines] == found.names.tolist()
     assert [np.float32(line.split()[1]) for line in lines] == list(found.scores)
-
-
-def test_detect_accepts_an_exported_detector_with_its_batch_size(home, tmp_path, capsys):
-    for name in ("checkpoint", "detector.fcos"):
-        command("detect", home / "cloud.npy", "--checkpoint", home / name, "--out", tmp_path / f"{name}.json")
-    assert (tmp_path / "checkpoint.json").read_bytes() == (tmp_path / "detector.fcos.json").read_bytes()
-    words = ["detect", str(home / "cloud.npy"), "--checkpoint", str(home / "detector.fcos"), "--batch-size", "2"]
-    assert_one_line_error(capsys, [*words, "--out", str(tmp_path / "a")], r"batch size: got 2, expected 1")
 
 
 DAMAGE = {

@@ -38,7 +38,7 @@ DETECTORS = {
 def test_boxes_equal_xlas_except_for_rounding(name):
     detector = DETECTORS[name]()
     session = onnxruntime.InferenceSession(program_graph(detector), providers=["CPUExecutionProvider"])
-    for seed in range(3):
+    for seed in range(1 if name == "hdl32e" else 3):  # of which the full size takes seconds per cloud
         cloud = make_cloud(make_frame(seed, detector.sensor).points, detector.config, sensor=detector.sensor)
         boxes, scores, labels, used = session.run(None, {"points": cloud.points, "valid": cloud.valid})
         expected = detector.detect(cloud)

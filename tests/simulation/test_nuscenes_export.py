@@ -1,5 +1,6 @@
 """Check synthetic data sets: official layout, exact annotations, and identical bytes after interruptions."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -160,7 +161,9 @@ def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, 
 
 @pytest.mark.slow
 def test_killed_runs_resume_to_the_same_bytes(tmp_path):
+    (tmp_path / "coarse.json").write_text(json.dumps(sensor_to_json(dataclasses.replace(TINY, num_columns=16))))
     quick = ["--scenes", "2", "--streets", "plain", "--no-rolling-shutter", "--workers", "1"]
+    quick += ["--sensor", str(tmp_path / "coarse.json")]
     killed = killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", *quick))
     whole, states = tmp_path / "killed-whole", set()
     for root in killed:

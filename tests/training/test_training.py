@@ -286,9 +286,10 @@ def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches
     layout = image_layout(TINY, CONFIG.model)
     expected = {name: np.zeros(leaf.shape) for name, leaf in params.items()}
     losses, positives, candidates = {"classification": 0.0, "l1": 0.0}, 0, 0
+    project = jax.jit(project_points, static_argnames=("sensor", "num_rounds"))
     targets_of = jax.jit(lambda *sample: sample_losses(*sample, config=choices, layout=layout, axes=axes)[1])
     for points, valid, boxes, labels, box_valid in zip(*jax.tree.leaves(batch), strict=True):
-        image = project_points(points, valid, TINY, num_rounds=CONFIG.projection.num_rounds)
+        image = project(points, valid, TINY, num_rounds=CONFIG.projection.num_rounds)
         outputs, _ = detector.apply({"params": params}, jax.tree.map(lambda leaf: leaf[None], image), train=True)
         outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
         targets = targets_of(outputs, image, boxes, labels, box_valid)
