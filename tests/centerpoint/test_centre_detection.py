@@ -86,8 +86,9 @@ def test_points_to_boxes_in_any_order_and_of_nothing():
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nothing))
         assert not nothing.valid.any()
     stages = make_stages(detector)
-    empty = stages.prepare(points, ~every)
-    boxes, scores, _, valid = stages.candidates(stages.network(variables, empty), empty)
+    empty = jax.jit(stages.prepare)(points, ~every)
+    outputs = jax.jit(stages.network)(variables, empty)
+    boxes, scores, _, valid = jax.jit(stages.candidates)(outputs, empty)
     assert len(boxes) > 0
     assert not valid.any()
     assert not scores.any()

@@ -330,6 +330,5 @@ def test_a_real_scene_has_the_same_boxes_in_all_forms(real_data, home, tmp_path)
     (tmp_path / "poses.json").write_text(json.dumps(lines))
     folder = root / "samples" / "LIDAR_TOP"
     assert stream(home, out, folder, "--poses", tmp_path / "poses.json") == expected
-    for form in ("ros1", "sqlite", "mcap"):
-        bag = write_recording(tmp_path / form.replace(" ", "_"), form, content)
-        assert without_file(stream(home, out, bag, "--odometry /odom")) == without_file(expected), form
+    bag = write_recording(tmp_path / "bag", "mcap", content)
+    assert without_file(stream(home, out, bag, "--odometry /odom")) == without_file(expected)

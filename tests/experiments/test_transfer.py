@@ -80,6 +80,7 @@ def place_package(patch: pytest.MonkeyPatch, home: Path) -> None:
     for module in (shipped_weights, model_card):
         patch.setattr(module, "SHIPPED", home / "weights")
     patch.setattr(shipped_weights, "RESULTS", home / "results")
+    patch.setattr(shipped_weights, "_CURVE_FRAMES", 1)
 
 
 @pytest.fixture

@@ -159,7 +159,8 @@ def test_centres_are_offset_along_the_axes_of_the_configuration(axes):
         return Outputs(jnp.tile(logits, (1, number, 1)), one, jnp.zeros((1, number, kinds))), {}
 
     points = make_frame(0, TINY).points
-    found = make_detect(build_detector(config, TINY)._replace(apply=apply))({}, points, np.ones(len(points), bool))
+    detect = jax.jit(make_detect(build_detector(config, TINY)._replace(apply=apply)))
+    found = detect({}, points, np.ones(len(points), bool))
     boxes = np.asarray(found.boxes, np.float64)
     assert found.valid.all()
     distance = np.hypot(*boxes[:, :2].T)[:, None]

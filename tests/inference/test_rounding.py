@@ -21,17 +21,23 @@ def rounded(x, bits):
     return jax.lax.bitcast_convert_type(word >> cut << cut, jnp.float32)
 
 
-@pytest.mark.parametrize(("bits", "largest_mm"), [(10, 2.0), (7, 16.0)], ids=["TF32", "bfloat16"])
-def test_rounding_in_the_heads_moves_centres_by_millimetres(bits, largest_mm, monkeypatch):
-    """Emulates the default rounding of GPUs (TF32) and TPUs (bfloat16); with ``pytest -s``, prints the effect."""
+@pytest.fixture(scope="module")
+def exact():
+    """The shipped detector, an image, and its predictions without rounding."""
     trained = load_trained("hdl32e")
     stages, frame = make_stages(trained.model), unseen_frames(trained.sensor, 1).frame(0)
     cloud = make_cloud(frame.points, trained.config, sensor=trained.sensor)
     image = jax.jit(stages.prepare)(cloud.points, cloud.valid)
-    exact = jax.jit(stages.network)(trained.variables, image)
+    return trained, stages.network, image, jax.jit(stages.network)(trained.variables, image)
+
+
+@pytest.mark.parametrize(("bits", "largest_mm"), [(10, 2.0), (7, 16.0)], ids=["TF32", "bfloat16"])
+def test_rounding_in_the_heads_moves_centres_by_millimetres(bits, largest_mm, exact, monkeypatch):
+    """Emulates the default rounding of GPUs (TF32) and TPUs (bfloat16); with ``pytest -s``, prints the effect."""
+    trained, network, image, exact = exact
     convolve = heads.convolve
     monkeypatch.setattr(heads, "convolve", lambda x, k, **how: convolve(rounded(x, bits), rounded(k, bits), **how))
-    rough = jax.jit(lambda *given: stages.network(*given))(trained.variables, image)
+    rough = jax.jit(lambda *given: network(*given))(trained.variables, image)
     probability, other = (np.asarray(jax.nn.softmax(outputs.logits))[:, :-1] for outputs in (exact, rough))
     place, label = np.nonzero(probability > trained.config.inference.min_probability)
     moved_mm = 1e3 * np.abs(exact.regression - rough.regression)[place, :3, label].max()
