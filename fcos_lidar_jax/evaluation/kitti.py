@@ -21,6 +21,7 @@ TABLE_HEAD = (*DIFFICULTIES, f"objects: {' / '.join(DIFFICULTIES)}")
 
 _NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _POSITIONS = 40
+_LOWEST = min(height for height, *_ in DIFFICULTIES.values())
 _NO_ALPHA = -10
 
 _Pairs = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -54,8 +55,9 @@ def evaluate_kitti(
         ``{"metric": "AP_R40", "num_frames", "classes": {class: {"min_overlap", "num_truth", "bev", "3d", "image",
         "aos"}}}``; the last five by difficulty. An average precision without an object that counts is None. If the
         left side of all image boxes is negative, ``"image"`` and ``"aos"`` are left out; if any alpha is -10,
-        ``"aos"`` is. Also ``"unknown_types": {type: lines}``, and ``"image_only"``, the number of detections
-        without a box in 3D.
+        ``"aos"`` is. If no detection has a box in 3D, ``"bev"`` and ``"3d"`` are left out. Also
+        ``"unknown_types": {type: lines}``, and the numbers of detections without a box in 3D (``"image_only"``)
+        and lower than every difficulty's limit (``"low"``).
 
     Raises:
         ValueError: naming the file, the line and the field, what was found and what was expected.
@@ -75,13 +77,16 @@ def evaluate_kitti(
     if not files:
         raise ValueError(f"{results_dir}: no .txt file in it, expected one for every frame")
     truth, found = _Objects([Path(label_dir) / file.name for file in files]), _Objects(files, scored=True)
-    flat = np.isnan(found.reach)[np.isin(found.types, CLASSES)]
-    if flat.all() and len(flat):
-        raise ValueError(f"{results_dir}: got boxes in the image only, expected height to rotation_y of 3D boxes")
+    named = np.isin(found.types, CLASSES)
+    flat, low = np.isnan(found.reach)[named], (found.height < _LOWEST)[named]
     kinds = _overlapping(truth, found)
+    if flat.all() and len(flat):
+        kinds = {kind: pairs for kind, pairs in kinds.items() if kind not in ("bev", "3d")}
+    if not kinds:
+        raise ValueError(f"{results_dir}: got boxes neither in the image nor in 3D, expected either")
     scores = {name: _evaluate_class(name, truth, found, kinds) for name in classes}
     skipped = Counter(name for name in found.types.tolist() if name not in (*CLASSES, "DontCare"))
-    told = {"unknown_types": dict(sorted(skipped.items())), "image_only": int(flat.sum())}
+    told = {"unknown_types": dict(sorted(skipped.items())), "image_only": int(flat.sum()), "low": int(low.sum())}
     return {"metric": "AP_R40", "num_frames": len(files), "classes": scores, **told}
 
 
@@ -106,8 +111,10 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
     if skipped := [f"{count} {name}" for name, count in metrics["unknown_types"].items()]:
         lines.append(f"skipped, none of KITTI's types: {', '.join(skipped)}")
-    if metrics["image_only"]:
+    if metrics["image_only"] and any("3d" in scores for scores in metrics["classes"].values()):
         lines.append(f"without a box in 3D, and therefore false in bev and 3d: {metrics['image_only']} detections")
+    if metrics["low"]:
+        lines.append(f"lower than {_LOWEST} pixels in the image, and therefore ignored: {metrics['low']} detections")
     if metrics.get("left_out"):
         lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
     return "\n".join(lines)

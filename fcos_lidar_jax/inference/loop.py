@@ -86,7 +86,7 @@ def detect_clouds(
                 aligned.announce(aligned.points(first.points))  # once it was read: an error would make this moot
                 told = True
             if not quiet:
-                tell("compiling the detector: some seconds on a CPU", once=True)
+                tell("compiling the detector: up to a minute on a CPU", once=True)
             running.append((group, loaded, compiled(*shard_batch(clouds, mesh))))
             while len(running) > bool(ahead):
                 yield from batches.collect(*running.popleft())

@@ -53,7 +53,7 @@ def test_detect_writes_boxes_pictures_and_a_page(home, tmp_path, capsys):
     out, clouds, page = tmp_path / "boxes.json", [home / "good.npy", home / "nan.npy"], tmp_path / "page.html"
     command(*detect(home, *clouds, "--out", out, "--pictures", tmp_path, "--page", page))
     told = capsys.readouterr().err
-    assert told.count("compiling the detector: some seconds on a CPU") == 1
+    assert told.count("compiling the detector: up to a minute on a CPU") == 1
     progress = [line for line in told.splitlines() if line.startswith("files ")]
     assert len(progress) == 2
     assert "2/2" in progress[1]

@@ -256,6 +256,21 @@ def test_results_are_read_as_by_the_development_kit(tmp_path, case):
     assert [text.startswith(told) for text in lines] == [True] * bool(told)
 
 
+def test_boxes_in_the_image_only_and_in_3d_only_have_their_own_rows(tmp_path):
+    truth = street()
+    columns = [row.split() for row in street(score=0.8)]
+    flat = "".join(" ".join([*c[:8], *["-1"] * 3, *["-1000"] * 3, "-10", c[15]]) + "\n" for c in columns)
+    summary = evaluate_texts(tmp_path, [("".join(truth), flat)])
+    assert summary["classes"]["Car"]["image"]["moderate"] == pytest.approx(100.0)
+    assert summary["classes"]["Car"].keys().isdisjoint(("bev", "3d"))
+    deep = "".join(" ".join([*c[:3], "-10", *["-1"] * 4, *c[8:]]) + "\n" for c in columns)
+    summary = evaluate_texts(tmp_path, [("".join(truth), deep)])
+    assert "image" not in summary["classes"]["Car"]
+    assert summary["classes"]["Car"]["3d"]["moderate"] == 0  # as in the development kit
+    told = "lower than 25 pixels in the image, and therefore ignored: 50 detections"
+    assert told in describe_kitti(summary)
+
+
 def test_bad_results_get_one_line(tmp_path):
     labels = tmp_path / "labels"
     with refused("classes: got 'Vans', expected"):
@@ -264,7 +279,7 @@ def test_bad_results_get_one_line(tmp_path):
         evaluate_kitti(tmp_path / "none", labels)
     for result, message in (
         (line(score=0.5) + line(), "000000.txt: line 2: got 15 values, expected 16, the score last"),
-        (FLAT, "results: got boxes in the image only, expected height to rotation_y"),
+        (FLAT.replace("100 100 150 150", "-1 -1 -1 -1"), "results: got boxes neither in the image nor in 3D"),
         (line(score=0.5).replace("0.5", "nan"), "line 1: score: got 'nan', expected a finite number"),
     ):
         with refused(message):
