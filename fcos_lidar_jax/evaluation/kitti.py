@@ -113,8 +113,8 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
         lines.append(f"skipped, none of KITTI's types: {', '.join(skipped)}")
     if metrics["image_only"] and any("3d" in scores for scores in metrics["classes"].values()):
         lines.append(f"without a box in 3D, and therefore false in bev and 3d: {metrics['image_only']} detections")
-    if metrics["low"]:
-        lines.append(f"lower than {_LOWEST} pixels in the image, and therefore ignored: {metrics['low']} detections")
+    if low := metrics["low"]:
+        lines.append(f"lower than {_LOWEST} pixels in the image, and therefore ignored: {low} detections")
     if metrics.get("left_out"):
         lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
     return "\n".join(lines)

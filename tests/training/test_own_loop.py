@@ -22,7 +22,8 @@ for state, metrics in (first, *others):
     assert float(metrics["learning_rate"]) == np.float32(1e-4) and float(metrics["loss/logit_size"]) > 0
     for name in ("loss/total", "loss/logit_size", "positives"):
         np.testing.assert_allclose(metrics[name], first[1][name], rtol=1e-4)
-own, *trained = (np.asarray(s.params["predictions"]["kernel"])[-1] for s in (start, *(s for s, _ in (first, *others))))
+states = start, *(state for state, _ in (first, *others))
+own, *trained = (np.asarray(state.params["predictions"]["kernel"])[-1] for state in states)
 assert all((kernel != own).mean() > 0.9 for kernel in trained)  # the weights of the additional channel
 """
 
