@@ -44,8 +44,17 @@ int main(int count, char **words) {
     return 1;
   }
   std::vector<float> cloud(file.tellg() / sizeof(float));
+  if (int64_t(file.tellg()) % (columns * sizeof(float))) {
+    std::fprintf(stderr, "%s: found %lld bytes, expected rows of %lld float32\n", words[2], (long long)file.tellg(),
+                 (long long)columns);
+    return 1;
+  }
   file.seekg(0).read(reinterpret_cast<char *>(cloud.data()), cloud.size() * sizeof(float));
 
+  if (!api) {
+    std::fprintf(stderr, "the library of onnxruntime is older than its headers\n");
+    return 1;
+  }
   OrtEnv *env;
   OrtSessionOptions *options;
   OrtSession *session;
