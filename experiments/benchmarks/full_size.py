@@ -11,7 +11,6 @@ parameters.
 
 import dataclasses
 import functools
-import resource
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.training_steps import training_steps
+from experiments.hardware import peak_memory_gib
 from experiments.keyframe import read_keyframe
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
@@ -102,7 +102,7 @@ def measure(args: Args) -> dict[str, Any]:
         "parameters": count_parameters(shapes["params"]),
         "boxes": len(frame.boxes),
         "milliseconds": {name: ms["median_ms"] for name, ms in times.items()},
-        "peak_memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+        "peak_memory_gib": peak_memory_gib(),
         "training_gib": training_memory(config),
     }
 

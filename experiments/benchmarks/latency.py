@@ -33,7 +33,7 @@ from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.inference import make_detect, make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.locations import image_layout
-from fcos_lidar_jax.models import Variables, build_detector
+from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.models.convolution import Image
 from fcos_lidar_jax.models.detector import Network, network_input
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, PRESETS
@@ -63,10 +63,10 @@ class Args(Options):
 
 
 @contextlib.contextmanager
-def simulated_sweeps(sensor: Sensor) -> Iterator[tuple[NuScenes, str]]:
-    """Provide a simulated drive in the nuScenes layout and a keyframe with nine previous sweeps."""
+def simulated_sweeps(sensor: Sensor, keyframes: int = 2) -> Iterator[tuple[NuScenes, str]]:
+    """Provide a simulated drive in the nuScenes layout and its last keyframe, with nine previous sweeps."""
     with tempfile.TemporaryDirectory() as folder:
-        spec = DatasetSpec(1, 0, 2, sensor, False, "v1.0-synthetic")
+        spec = DatasetSpec(1, 0, keyframes, sensor, False, "v1.0-synthetic")
         write_dataset(spec, Path(folder), workers=1, report=lambda _: None)
         data = NuScenes(folder, spec.version)
         yield data, data.sample_tokens[-1]
@@ -122,27 +122,41 @@ def network_parts(config: Config, sensor: Sensor) -> Parts:
     return Parts(preprocess, *front, part("fpn"), part("heads"))
 
 
+def stage_calls(detector: Detector, variables: Variables, cloud: Cloud) -> dict[str, Call]:
+    """Make calls of a detector's stages for one cloud, with precomputed inputs."""
+    stages, detect = make_stages(detector), jax.jit(make_detect(detector))
+    prepare, network, postprocess, refine = (
+        jax.jit(stage) for stage in (stages.prepare, stages.network, stages.postprocess, stages.refine)
+    )
+    points, valid = jax.device_put((cloud.points, cloud.valid))
+    sample = prepare(points, valid)
+    outputs = network(variables, sample)
+    boxes = postprocess(outputs, sample)
+    calls: dict[str, Call] = {
+        "transfer": lambda: jax.device_put((cloud.points, cloud.valid)),
+        "preparation": lambda: prepare(points, valid),
+        "network": lambda: network(variables, sample),
+        "post-processing": lambda: postprocess(outputs, sample),
+    }
+    if detector.refine is not None:
+        calls["second look"] = lambda: refine(variables, points, valid, *boxes)
+    return calls | {"points to boxes, one program": lambda: detect(variables, points, valid)}
+
+
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:
-    """Make calls of the stages for one cloud, with precomputed inputs."""
-    parts, detector = network_parts(config, sensor), build_detector(config, sensor)
-    stages = make_stages(detector)
-    prepare, network, postprocess = map(jax.jit, (stages.prepare, stages.network, stages.postprocess))
-    detect = jax.jit(make_detect(detector))
+    """Make calls of FCOS-LiDAR's stages, and of the parts of its network, for one cloud."""
+    parts, calls = network_parts(config, sensor), stage_calls(build_detector(config, sensor), variables, cloud)
+    calls["MRV"] = calls.pop("preparation")
     body = jax.jit(lambda v, f: parts.backbone(v, parts.stem(v, parts.preprocess(f))))
     front = jax.jit(lambda v, levels: parts.heads(v, parts.fpn(v, levels)))
-    points, valid = jax.device_put((cloud.points, cloud.valid))
-    image = prepare(points, valid)
-    levels = body(variables, image.features[None])
-    pyramid, outputs = parts.fpn(variables, levels), network(variables, image)
-    return {
-        "transfer": lambda: jax.device_put((cloud.points, cloud.valid)),
-        "MRV": lambda: prepare(points, valid),
-        "Backbone (stem and backbone)": lambda: body(variables, image.features[None]),
+    features = calls["MRV"]().features[None]
+    levels = body(variables, features)
+    pyramid = parts.fpn(variables, levels)
+    return calls | {
+        "Backbone (stem and backbone)": lambda: body(variables, features),
         "Heads (pyramid and heads)": lambda: front(variables, levels),
         "pyramid alone": lambda: parts.fpn(variables, levels),
         "heads alone": lambda: parts.heads(variables, pyramid),
-        "post-processing": lambda: postprocess(outputs, image),
-        "points to boxes, one program": lambda: detect(variables, points, valid),
     }
 
 

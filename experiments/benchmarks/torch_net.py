@@ -2,9 +2,10 @@
 
 Modality-wise stem by ``groups=9``, LiDAR-Net, feature pyramid, heads with group norm, 1x1 merges per branch.
 Sizes come from the environment: ``BATCH``, ``HEIGHT`` and ``WIDTH`` of the image, its ``ROUNDS``, and the
-channels of each ``TYPE``, of ``STEM``, ``PYRAMID``, ``HEAD`` and the backbone's stages (``WIDTHS``).
-``FNS["train"]`` is a forward and a backward pass in ``channels_last``; there is no assignment, no optimizer and
-no projection in it. Needs torch, which the project itself does not.
+channels of each ``TYPE``, of ``STEM``, ``PYRAMID``, ``HEAD`` and the backbone's stages (``WIDTHS``). ``DEVICE`` is
+``cpu`` or ``cuda``. Options are 0 or 1: ``CHANNELS_LAST`` (default 1), ``AUTOCAST`` to bfloat16, ``COMPILE`` by
+``torch.compile``. ``FNS["forward"]`` is a forward pass as in detection, ``FNS["train"]`` a forward and a backward
+pass; there is no assignment, no optimizer and no projection in it. Needs torch, which the project itself does not.
 """
 
 import os
@@ -19,6 +20,11 @@ HEIGHT, WIDTH, ROUNDS, BATCH = (int(os.environ.get(name, value)) for name, value
 TYPE, STEM, PYRAMID, HEAD = (int(os.environ.get(name, value)) for name, value in _CHANNELS.items())
 WIDTHS = tuple(map(int, os.environ.get("WIDTHS", "64,128,128,128").split(",")))
 BLOCKS, STRIDES = (4, 4, 1, 1), (1, 2, 2, 2)
+DEVICE = os.environ.get("DEVICE", "cpu")
+CHANNELS_LAST, AUTOCAST, COMPILE = (
+    os.environ.get(name, default) == "1"
+    for name, default in (("CHANNELS_LAST", "1"), ("AUTOCAST", "0"), ("COMPILE", "0"))
+)
 
 
 def conv(inputs: int, outputs: int, size: int, **options: int) -> nn.Conv2d:
@@ -98,14 +104,37 @@ class Network(nn.Module):
         return found
 
 
-network = Network().to(memory_format=torch.channels_last)
-images = torch.randn(BATCH, 9 * ROUNDS, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
+torch.backends.cudnn.benchmark = torch.backends.cudnn.allow_tf32 = True  # As XLA does by default.
+layout = torch.channels_last if CHANNELS_LAST else torch.contiguous_format
+network = Network().to(DEVICE, memory_format=layout)
+run = torch.compile(network) if COMPILE else network
+images = torch.randn(BATCH, 9 * ROUNDS, HEIGHT, WIDTH, device=DEVICE).contiguous(memory_format=layout)
+
+
+def _outputs() -> list[torch.Tensor]:
+    with torch.autocast(DEVICE, torch.bfloat16, enabled=AUTOCAST):
+        return run(images)
+
+
+def _finish() -> None:
+    if DEVICE == "cuda":  # otherwise only the launches are timed
+        torch.cuda.synchronize()
+
+
+def forward() -> None:
+    """One forward pass without gradients, with the statistics of batch normalization fixed."""
+    if network.training:
+        network.eval()
+    with torch.no_grad():
+        _outputs()
+    _finish()
 
 
 def train() -> None:
     """One forward and one backward pass."""
     network.zero_grad(set_to_none=True)
-    torch.stack([y.abs().mean() for y in network(images)]).sum().backward()
+    torch.stack([y.abs().mean() for y in _outputs()]).sum().backward()
+    _finish()
 
 
-FNS = {"train": train}
+FNS = {"forward": forward, "train": train}

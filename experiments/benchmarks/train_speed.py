@@ -17,7 +17,7 @@ import os
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,19 +27,24 @@ from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.inference.timing import Call
+from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.input_pipeline.database import cut_reading
+from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 
 Size = Literal["reduced", "slim", "full_64", "full"]
-_PEER = Path(__file__).with_name("torch_net.py")
+Function = Literal["forward", "train"]
+PEER = Path(__file__).with_name("torch_net.py")
 _PEER_LOOP = """
 import os, runpy, sys, time
 real = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
 sys.path.insert(0, os.path.dirname(sys.argv[1]))
-run = runpy.run_path(sys.argv[1])["FNS"]["train"]
+run = runpy.run_path(sys.argv[1])["FNS"][sys.argv[2]]
 run()
 print("ready", file=real, flush=True)
 for _ in sys.stdin:
@@ -54,7 +59,7 @@ class Args(Options):
     """Options of the comparison."""
 
     torch_python: Path  # Interpreter that has torch.
-    peer: Path = _PEER  # Program with FNS["train"].
+    peer: Path = PEER  # Program with FNS["train"].
     sizes: tuple[Size, ...] = ("reduced", "slim", "full_64", "full")  # Which to compare.
     repeats: int = 15  # Turns; ten times as many when reduced.
 
@@ -87,9 +92,15 @@ def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
 
 
 def turn_by_turn(
-    ours: Callable[[], Any], repeats: int, *, peer: Path, environment: Mapping[str, object], python: Path
+    ours: Call,
+    repeats: int,
+    *,
+    peer: Path,
+    environment: Mapping[str, object],
+    python: Path,
+    function: Function = "train",
 ) -> dict[str, float]:
-    """Time our call and a peer's training in turns, because the speed of a machine drifts.
+    """Time our call and a peer's function in turns, because the speed of a machine drifts.
 
     The peer runs in a separate process with its own interpreter and environment.
 
@@ -97,15 +108,15 @@ def turn_by_turn(
         medians in seconds after one run of each, and their ratio.
     """
     variables = {**os.environ, **{key: str(value) for key, value in environment.items()}}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     times: dict[str, list[float]] = {"ours": [], "peer": []}
     with subprocess.Popen(
-        [python, "-c", _PEER_LOOP, peer.absolute()], env=variables, bufsize=1, **pipes
+        [python, "-c", _PEER_LOOP, peer.absolute(), function], env=variables, bufsize=1, **pipes
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         if process.stdout.readline() != "ready\n":
-            raise ValueError(f'--peer: {peer}: got no FNS["train"] that runs')
+            raise ValueError(f'--peer: {peer}: got no FNS["{function}"] that runs')
         jax.block_until_ready(ours())
         for _ in range(repeats):
             began = time.perf_counter()
@@ -117,19 +128,46 @@ def turn_by_turn(
     return {**medians, "ratio": round(medians["ours"] / medians["peer"], 3), "repeats": repeats}
 
 
+def forward_pass(config: Config, sensor: Sensor, frames: Sequence[Frame]) -> Call:
+    """Make a call of the network, with random weights, on the range images of a batch of frames."""
+    detector = build_detector(config, sensor)
+    variables = jax.jit(detector.init)(jax.random.key(0))
+    batch = make_batch(frames, max_points=config.max_points, max_boxes=config.max_boxes)
+    images = jax.jit(jax.vmap(detector.prepare))(batch.points, batch.valid)
+    network = jax.jit(lambda variables, images: detector.apply(variables, images)[0])
+    return lambda: network(variables, images)
+
+
+def compare(
+    name: Size,
+    repeats: int,
+    *,
+    python: Path,
+    peer: Path = PEER,
+    function: Function = "train",
+    batch: int = 1,
+    precision: Literal["float32", "bfloat16"] = "float32",
+    **options: object,
+) -> dict[str, float]:
+    """Compare our training step, or our forward pass, with a peer's; options are of its environment."""
+    size = _SIZES[name]
+    config, sensor = of_size(size)
+    config = change(model__precision=precision)(config)
+    frames = [make_frame(0, sensor, num_objects=30, reading=cut_reading(1))] * batch
+    over = 64 // size["STEM"]
+    others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
+    # Other peers use other names.
+    environment = {**size, **others, "TRAIN": 1, "CL": 1, "BATCH": batch, **options}
+    ours = (training_steps if function == "train" else forward_pass)(config, sensor, frames)
+    return turn_by_turn(ours, repeats, peer=peer, environment=environment, python=python, function=function)
+
+
 def measure(args: Args) -> dict[str, Any]:
     """Compare at the selected sizes."""
     record: dict[str, Any] = {"peer": args.peer.name}
     for name in args.sizes:
-        size = _SIZES[name]
-        config, sensor = of_size(size)
-        frames = [make_frame(0, sensor, num_objects=30, reading=cut_reading(1))]
-        over = 64 // size["STEM"]
-        others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
-        sizes = {**size, **others, "TRAIN": 1, "CL": 1}  # Other peers use other names.
-        peer = {"peer": args.peer, "environment": sizes, "python": args.torch_python}
         repeats = args.repeats * (10 if name == "reduced" else 1)
-        record[name] = turn_by_turn(training_steps(config, sensor, frames), repeats, **peer)
+        record[name] = compare(name, repeats, python=args.torch_python, peer=args.peer)
         print(f"{name}: {json.dumps(record[name])}", flush=True)
     return record
 

@@ -23,6 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from experiments.benchmarks.latency import stage_calls
 from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
@@ -30,11 +31,11 @@ from experiments.script import run_script
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import make_cloud
-from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
 
+_STAGES = {"image or pillars": "preparation", "network": "network", "boxes": "post-processing"}
 _CANDIDATES = 4450  # Candidates of the range view on all levels; the coarsest have less than 1000 each.
 
 
@@ -56,22 +57,6 @@ ROWS = _rows("ten sweeps") + _rows("one sweep", num_sweeps=1)
 PEER = ROWS[0]
 
 
-def stage_calls(config: Config, points: Any, sensor: Any) -> tuple[dict[str, Call], int]:
-    """Make timed calls of a detector's stages on one cloud with random weights; also returns its parameters."""
-    detector = build_detector(config, sensor)
-    stages, variables = make_stages(detector), detector.init(jax.random.key(0))
-    cloud = make_cloud(points, config, sensor=sensor, num_close=0)
-    prepare, network, boxes = (jax.jit(part) for part in (stages.prepare, stages.network, stages.postprocess))
-    image = prepare(cloud.points, cloud.valid)
-    outputs = network(variables, image)
-    calls: dict[str, Call] = {
-        "image or pillars": lambda: prepare(cloud.points, cloud.valid),
-        "network": lambda: network(variables, image),
-        "boxes": lambda: boxes(outputs, image),
-    }
-    return calls, count_parameters(variables["params"])["total"]
-
-
 def figures(args: Args) -> dict[str, Any]:
     """Measure times of the stages and of a training step, and count parameters, by row."""
     scale = simulated_scale(args)
@@ -80,10 +65,13 @@ def figures(args: Args) -> dict[str, Any]:
     for row in TABLE.only(args.rows).rows:
         config = row.change(scale.base)
         frame = scale.frames("test", config.num_sweeps).frame(0)
-        parts, parameters = stage_calls(config, frame.points, scale.sensor)
-        parts["training step"] = training_steps(config, scale.sensor, [frame])
-        calls |= {(row.label, stage): call for stage, call in parts.items()}
-        columns[row.label] = {"parameters, thousands": parameters / 1000}
+        detector = build_detector(config, scale.sensor)
+        variables = detector.init(jax.random.key(0))
+        cloud = make_cloud(frame.points, config, sensor=scale.sensor, num_close=0)
+        stages = stage_calls(detector, variables, cloud)
+        calls |= {(row.label, label): stages[stage] for label, stage in _STAGES.items()}
+        calls[row.label, "training step"] = training_steps(config, scale.sensor, [frame])
+        columns[row.label] = {"parameters, thousands": count_parameters(variables["params"])["total"] / 1000}
     measured = interleaved(calls, 2 if args.scale == "smoke" else 15)
     for (label, stage), times in measured.items():
         columns[label][f"{stage}, ms"] = times["median_ms"]

@@ -146,7 +146,7 @@ class Marked(WrappedFrames):
         return checksum(repr((self.frames.fingerprint(), "marked")).encode())
 
 
-def frames(work: Path, split: str) -> FrameSet:
+def frames(work: Path, split: str) -> CachedFrames:
     """Open the frames of a split, which are simulated once."""
     number, first = {"train": (TRAIN_FRAMES, 0), "test": (TEST_FRAMES, UNSEEN_SEED)}[split]
     reading, reach_m = CloudReading(1, "all", _BONNET_M), NUSCENES_HDL32E.limit_xy_m

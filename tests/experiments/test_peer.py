@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 
+from experiments.benchmarks.latency import stage_calls
 from experiments.changes import change
 from experiments.paper_tables.scales import quarter, smoke
 from experiments.studies import centerpoint
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import make_cloud
-from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
@@ -39,15 +39,13 @@ def test_the_stages_that_are_timed_are_the_detector(tmp_path):
     scale = smoke(tmp_path)
     points = scale.clouds(scale.base.num_sweeps)[0]
     config = change(inference__min_probability=0.0)(scale.base)  # random weights are sure of nothing
-    calls, parameters = centerpoint.stage_calls(config, points, scale.sensor)
     detector = build_detector(config, scale.sensor)
     variables = detector.init(jax.random.key(0))
-    assert parameters == sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
-    cloud = make_cloud(points, config, sensor=scale.sensor, num_close=0)
-    whole = jax.jit(make_detect(detector))(variables, cloud.points, cloud.valid)
+    calls = stage_calls(detector, variables, make_cloud(points, config, sensor=scale.sensor, num_close=0))
+    whole = calls["points to boxes, one program"]()
     assert whole.valid.any()
     expected = whole.boxes, whole.scores, whole.labels, whole.valid
-    for stage, of_whole in zip(calls["boxes"](), expected, strict=True):
+    for stage, of_whole in zip(calls["post-processing"](), expected, strict=True):
         np.testing.assert_allclose(stage, of_whole, rtol=1e-5, atol=1e-5)
 
 

@@ -1,0 +1,66 @@
+"""The measurements on a GPU: what is resumed, what a failure or a limit costs, and a row at toy size."""
+
+import json
+import os
+
+import pytest
+
+from experiments.benchmarks import gpu
+from experiments.benchmarks.gpu import Args, Row, measure
+
+
+def fails(args):
+    raise ValueError("cannot")
+
+
+def crashes(args):
+    os._exit(3)
+
+
+def test_the_same_command_continues_with_what_is_left(tmp_path, monkeypatch, capsys):
+    rows = {name: Row(limit_s, fails) for name, limit_s in (("bad", 10), ("long", 600), ("good", 10))}
+    monkeypatch.setattr(gpu, "PARTS", {"detection": rows, "torch": {"other": Row(10, fails)}})
+    reached = []
+
+    def run_row(args, part, name, row):
+        record = {"failed": "cannot"} if name == "bad" and "bad" not in reached else {"ms": 1}
+        reached.append(name)
+        gpu.keep(args, part, name, record, {})
+        return record
+
+    monkeypatch.setattr(gpu, "run_row", run_row)
+    args = Args(out=tmp_path, parts=("detection",))
+    file = tmp_path / "detection.json"
+    with pytest.raises(ValueError, match=r"^failed: detection, bad: see "):
+        measure(args)
+    assert reached == ["bad", "good"]
+    assert capsys.readouterr().out.splitlines()[2:] == ["left, for the same command: detection, long"]
+    measure(Args(out=tmp_path, limit_s=700))
+    assert reached[2:] == ["long", "other", "bad"], "failed rows come last"
+    assert f"detection, good: already in {file}\n" in capsys.readouterr().out
+    measure(args)
+    assert len(reached) == 5
+    rows = {name: {"ms": 1} for name in ("bad", "good", "long")}
+    assert json.loads(file.read_text()) == {"toy": False, "rows": rows}
+    with pytest.raises(
+        ValueError, match=r"detection\.json: toy: found False, expected True: choose another folder"
+    ):
+        measure(Args(out=tmp_path, toy=True))
+
+
+@pytest.mark.slow
+def test_a_row_that_fails_crashes_or_takes_too_long_costs_only_itself(tmp_path, monkeypatch):
+    rows = {"late": Row(0, fails), "wrong": Row(90, fails), "crashed": Row(90, crashes)}
+    monkeypatch.setattr(
+        gpu, "PARTS", {"torch": {**rows, "toy": Row(90, gpu.PARTS["projection"]["rounds"].measure)}}
+    )
+    with pytest.raises(ValueError, match=r"^failed: torch, late; torch, wrong; torch, crashed: see "):
+        measure(Args(out=tmp_path, parts=("torch",), toy=True))
+    record = json.loads((tmp_path / "torch.json").read_text())
+    late, wrong, crashed, toy = record["rows"].values()
+    assert late["failed"] == "not finished after 0 s"
+    assert wrong["failed"] == "exit code 1: ValueError: cannot"
+    assert crashed["failed"] == "exit code 3: nothing said"
+    assert toy["single"]["7"]["median_ms"] > 0
+    assert toy["peak_memory_gib"] > 0
+    assert {"device", "jax", "git"} <= record.keys()
