@@ -159,7 +159,9 @@ def test_unknown_forms_are_rejected():
         winners(jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.uint32), num_cells=1, num_rounds=1, form="heap")
 
 
-@pytest.mark.parametrize("sensor", PRESETS.values(), ids=PRESETS)
+@pytest.mark.parametrize(
+    "sensor", [s for s in PRESETS.values() if s.azimuth_limits_rad is None], ids=lambda sensor: sensor.name
+)
 def test_columns_run_clockwise_from_azimuth_pi(sensor):
     """Column 0 starts at azimuth pi, for both signs of y = 0, and the last column ends there."""
     x, _, z = sensor.origin_m

@@ -206,6 +206,7 @@ def test_the_warning_is_about_the_current_sweep_only():
 
 # Pairs (detector's sensor, cloud's sensor) whose beams and columns are too alike for the warning.
 ALIKE = {
+    *itertools.permutations(("kitti_hdl64e", "kitti_camera")),
     *(("kitti_hdl64e", "pandar64"), ("waymo_top", "pandar64"), ("os1_64", "os1_128")),
 }
 
