@@ -7,6 +7,7 @@ import re
 
 import pytest
 
+from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.config import (
     AugmentConfig,
     Config,
@@ -32,6 +33,7 @@ from fcos_lidar_jax.presets import (
     PRESETS,
     QUICKSTART,
 )
+from fcos_lidar_jax.sensors import load_sensor
 
 MISSING = object()
 
@@ -97,6 +99,8 @@ def test_kitti_compact_has_the_data_of_kitti_and_the_network_of_compact():
         channel_scale=KITTI.model.channel_scale,
     )
     assert KITTI_COMPACT.model == scaled
+    check_augmentation(KITTI_COMPACT.augment, load_sensor(KITTI_COMPACT.sensor))  # stays in the camera's sector
+    assert KITTI_COMPACT.sensor == "kitti_camera"
     assert (KITTI_COMPACT.optimizer, KITTI_COMPACT.inference) == (COMPACT.optimizer, COMPACT.inference)
 
 

@@ -12,7 +12,7 @@ SMALLER = """
 import linear_network, tiny_run
 from fcos_lidar_jax import presets, sensors
 presets.QUICKSTART, sensors.SHORT_RANGE = tiny_run.CONFIG, tiny_run.SENSOR
-linear_network.use()  # tests/models asks how the stem of the network takes an additional channel
+linear_network.use()  # test_onnx_graph.py has a stem with a tenth channel
 """
 CHECKS = """
 assert mesh.size == 2
