@@ -62,6 +62,7 @@ def test_detect_accepts_an_exported_detector_with_its_batch_size(home, tmp_path,
     assert_one_line_error(capsys, [*words, "--out", str(tmp_path / "a")], r"batch size: got 2, expected 1")
 
 
+@pytest.mark.optimised
 def test_the_program_cleans_raw_clouds(home):
     trained, points = fcos.load_detector(home / "checkpoint"), np.load(home / "cloud.npy")
     exported = load_exported(home / "detector.fcos").exported
@@ -137,6 +138,7 @@ def test_a_file_of_an_older_version_is_read(home, tmp_path):
     assert load_exported(tmp_path / "older.fcos").config == load_exported(home / "detector.fcos").config
 
 
+@pytest.mark.optimised
 def test_the_documented_code_runs_without_this_package(home):
     code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), re.DOTALL)
     hide = "import os, sys; sys.modules['fcos_lidar_jax'] = sys.modules['flax'] = None"
