@@ -4,6 +4,7 @@
     python -m experiments.studies.transfer --checkpoint RUN --only simulated
     python -m experiments.studies.transfer --data FOLDER --only fine_tuning
     python -m experiments.studies.transfer --data FOLDER --only simulated --no-second-look --out without.json
+    python -m experiments.studies.transfer --data FOLDER --mirrored --out experiments/results/transfer_mirrored.json
 
 FOLDER contains ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_scene0103/`` (two keyframes of
 another) and ``nuscenes_scene0061/`` (one of a third). The simulated keyframes are of unseen drives, as written by
@@ -74,6 +75,7 @@ class Args(Options):
     seed: int = 77  # Seed of the drives.
     second_look: bool = True  # Use the detector's second look, if it has one.
     across_classes: bool = False  # NMS across classes: one box per object.
+    mirrored: bool = False  # Detect in the view mirrored in x as well, which doubles the time.
     fine_tuning_steps: int = 1000  # Updates, each on one real keyframe.
     work: Path = Path("outputs/transfer")  # Folder of simulated drives and fine-tuning runs.
 
@@ -101,6 +103,13 @@ def drives_of(frames: NuScenesFrames) -> list[int]:
     """Number the drive of each keyframe, from 0."""
     scenes = [frames.nuscenes.scene_of(token) for token in frames.tokens]
     return np.unique(scenes, return_inverse=True)[1].tolist()
+
+
+def applied(args: Args, detector: TrainedDetector) -> TrainedDetector:
+    """Change the detection of a trained detector as the options say."""
+    detector = detector if args.second_look else detector.without_second_look()
+    detector = detector.with_inference(nms_across_classes=True) if args.across_classes else detector
+    return detector.with_inference(flips="x") if args.mirrored else detector
 
 
 def measured(
@@ -179,7 +188,7 @@ def fine_tuning(args: Args) -> Iterator[dict[str, Any]]:
     ):
         options = {"steps": args.fine_tuning_steps, "seed": 0, "weights": weights}
         detector = trained(runs / name.replace(" ", "_"), config, train, **options)
-        record[name] = measured(detector, test)
+        record[name] = measured(applied(args, detector), test)
         yield record
 
 
@@ -187,11 +196,9 @@ def main(args: Args) -> None:
     """Measure the selected parts and save after each."""
     if unknown := {*args.only} - {"simulated", "fine_tuning", *REAL}:
         raise ValueError(f"--only: got {min(unknown)!r}, expected simulated, fine_tuning, or one of {REAL}")
-    detector, folder = load_trained(args.checkpoint), find_checkpoint(args.checkpoint)
-    looked = detector.config.refinement
-    detector = detector if args.second_look else detector.without_second_look()
-    if args.across_classes:
-        detector = detector.with_inference(nms_across_classes=True)
+    loaded, folder = load_trained(args.checkpoint), find_checkpoint(args.checkpoint)
+    looked = loaded.config.refinement
+    detector = applied(args, loaded)
     out = args.out or Path("outputs/transfer.json")
     described = read_description(folder)
     of = {"name": str(args.checkpoint), "step": described["step"], "hash": described["hash"]}

@@ -219,6 +219,7 @@ def test_fine_tuning_trains_the_network_and_keeps_the_augmentation_of_its_checkp
     monkeypatch.setattr(
         transfer, "trained", lambda folder, config, *_, **options: runs.append((folder, config, options))
     )
+    monkeypatch.setattr(transfer, "applied", lambda *_: None)
     monkeypatch.setattr(transfer, "measured", lambda *_: {})
     weights = tmp_path / "weights"
     given = change(augment=AugmentConfig(flip_y_probability=0.0))(CONFIG)
