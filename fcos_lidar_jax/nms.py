@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,8 @@ from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
 from fcos_lidar_jax.types import check_rows
 
-_T = TypeVar("_T")
-_Mean = Callable[..., Array]
-_COMMON_COUNTS = (1024, 2048)  # Numbers of slots that usually suffice for all valid boxes, of thousands of slots.
+_Members = Callable[[Array, Array, tuple[Array, ...]], tuple[Array, Array]]
+_BLOCK = 1024  # Boxes that are compared with a kept box at once; blocks without valid boxes are skipped.
 _MAX_TURN_RAD = np.pi / 3  # Merged boxes must agree on the heading within this angle.
 
 
@@ -118,9 +117,9 @@ def merge_boxes(
         return jnp.zeros((*kept.shape, boxes.shape[1]), jnp.float32)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
-    mean = functools.partial(_weighted_mean, threshold=iou_threshold, vertical=_is_vertical(overlap))
+    members = functools.partial(_members, threshold=iou_threshold, vertical=_is_vertical(overlap))
     arrays = jnp.asarray(boxes, jnp.float32), weights, labels, usable, kept, used
-    rows, matrix = (functools.partial(merge, mean) for merge in (_merged_by_rows, _merged_by_matrix))
+    rows, matrix = (functools.partial(merge, members) for merge in (_merged_by_rows, _merged_by_matrix))
     return in_form(form, {"rows": rows, "matrix": matrix}, *arrays, cpu="rows", default="matrix")
 
 
@@ -162,10 +161,10 @@ def _is_vertical(overlap: str) -> bool:
     return overlap == "3d"
 
 
-def _weighted_mean(
+def _members(
     box: Array, label: Array, candidates: tuple[Array, ...], *, threshold: float, vertical: bool
-) -> Array:
-    """Weighted mean, c, of the candidate boxes, [n, c], that overlap a box and have its label."""
+) -> tuple[Array, Array]:
+    """Sums of the weighted offsets, c, and of the weights of the candidates that a box is merged with."""
     boxes, oriented_boxes, weights, labels = candidates
     turn = wrap_angle(boxes[:, 6] - box[6])
     # Elementwise, because updating one column would make a GPU materialize [kept, n, c].
@@ -173,36 +172,43 @@ def _weighted_mean(
     member = _overlaps(oriented(box), oriented_boxes, threshold, vertical)
     member &= (labels == label) & (jnp.abs(turn) <= _MAX_TURN_RAD)
     weight = jnp.where(member, weights, 0.0)
-    shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
-    total = weight.sum()
-    mean = box + shift / jnp.where(total > 0, total, 1.0)
-    return mean.at[6].set(wrap_angle(mean[6]))
+    return jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0), weight.sum()
+
+
+def _moved(boxes: Array, shift: Array, weight: Array, used: Array) -> Array:
+    """Move boxes, [d, c], by the mean offset of their members."""
+    mean = boxes + shift / jnp.where(weight > 0, weight, 1.0)[:, None]
+    return jnp.where(used[:, None], mean.at[:, 6].set(wrap_angle(mean[:, 6])), 0.0)
 
 
 def _merged_by_rows(
-    mean: _Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
+    members: _Members, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
-    """Merge the kept boxes one at a time."""
+    """Compare the kept boxes with the boxes of a block one at a time."""
     kept_boxes, kept_labels = boxes[kept], labels[kept]
+    order = jnp.argsort(~usable, stable=True)
+    blocks = _in_blocks(boxes[order], oriented(boxes[order]), weights[order], labels[order])
 
-    def merge_all(order: Array) -> Array:
-        candidates = boxes[order], oriented(boxes[order]), weights[order], labels[order]
+    def within(block: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+        candidates = tuple(array[block] for array in blocks)
 
-        def merge(slot: Array, merged: Array) -> Array:
-            return merged.at[slot].set(mean(kept_boxes[slot], kept_labels[slot], candidates))
+        def add(slot: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+            shift, weight = members(kept_boxes[slot], kept_labels[slot], candidates)
+            return sums[0].at[slot].add(shift), sums[1].at[slot].add(weight)
 
-        return lax.fori_loop(0, used.sum(), merge, jnp.zeros_like(kept_boxes))
+        return lax.fori_loop(0, used.sum(), add, sums)
 
-    return _on_valid(merge_all, jnp.argsort(~usable, stable=True), usable)
+    nothing = jnp.zeros_like(kept_boxes), jnp.zeros_like(kept_boxes[:, 0])
+    return _moved(kept_boxes, *lax.fori_loop(0, _num_blocks(usable), within, nothing), used)
 
 
 def _merged_by_matrix(
-    mean: _Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
+    members: _Members, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
-    """Merge all kept boxes in one reduction over [kept, n]."""
+    """Compare all kept boxes with all boxes in one reduction over [kept, n]."""
     candidates = boxes, oriented(boxes), weights, labels
-    merged = jax.vmap(mean, (0, 0, None))(boxes[kept], labels[kept], candidates)
-    return jnp.where(used[:, None], merged, 0.0)
+    sums = jax.vmap(members, (0, 0, None))(boxes[kept], labels[kept], candidates)
+    return _moved(boxes[kept], *sums, used)
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
@@ -211,11 +217,18 @@ def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
     return intersection > threshold * union
 
 
-def _on_valid(compute: Callable[[Array], _T], order: Array, valid: Array) -> _T:
-    """Call ``compute`` on a prefix of ``order``, valid boxes first, that contains all valid boxes."""
-    counts = [*(count for count in _COMMON_COUNTS if count < len(order)), len(order)]
-    branches = [functools.partial(lambda count: compute(order[:count]), count) for count in counts]
-    return lax.switch(jnp.searchsorted(jnp.array(counts[:-1], jnp.int32), valid.sum()), branches)
+def _in_blocks(*arrays: Array) -> list[Array]:
+    """Reshape arrays to [blocks, block, ...], padded with zeros."""
+    count = len(arrays[0])
+    block = min(_BLOCK, count)
+    padded = (jnp.pad(array, [(0, -count % block)] + [(0, 0)] * (array.ndim - 1)) for array in arrays)
+    return [array.reshape(-1, block, *array.shape[1:]) for array in padded]
+
+
+def _num_blocks(valid: Array) -> Array:
+    """Number of blocks that contain all valid boxes, which come first."""
+    block = min(_BLOCK, len(valid))
+    return (valid.sum() + block - 1) // block
 
 
 def _ranking(scores: Array, valid: Array) -> Array:
@@ -223,32 +236,39 @@ def _ranking(scores: Array, valid: Array) -> Array:
     return jnp.lexsort((-scores, ~valid)).astype(jnp.int32)
 
 
-def _by_rows(boxes: Array, scores: Array, valid: Array, labels: Array, **options: Any) -> tuple[Array, Array]:
-    def suppress(order: Array) -> tuple[Array, Array]:
-        kept, used = _greedy(boxes[order], scores[order], valid[order], labels[order], **options)
-        return jnp.where(used, order[kept], 0), used
-
-    return _on_valid(suppress, _ranking(scores, valid), valid)
-
-
-def _greedy(
+def _by_rows(
     boxes: Array, scores: Array, valid: Array, labels: Array, *, threshold: float, max_outputs: int, vertical: bool
 ) -> tuple[Array, Array]:
-    def unfinished(state: tuple[Array, Array, Array]) -> Array:
-        count, alive, _ = state
-        return (count < max_outputs) & alive.any()
+    """Compare the boxes of a block, best block first, with the kept boxes of earlier blocks, then with its own."""
+    order = _ranking(scores, valid)
+    boxes, labels = boxes[order], labels[order]
+    blocks = _in_blocks(boxes, labels, valid[order])
+    size = blocks[0].shape[1]
 
-    def pick(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, alive, kept = state
-        best = jnp.argmax(jnp.where(alive, scores, -jnp.inf)).astype(jnp.int32)
-        # argmax cannot tell remaining boxes with score -inf from suppressed boxes.
-        best = jnp.where(alive[best], best, jnp.argmax(alive).astype(jnp.int32))
-        rivals = _overlaps(boxes[best], boxes, threshold, vertical) & (labels == labels[best])
-        return count + 1, (alive & ~rivals).at[best].set(False), kept.at[count].set(best)
+    def within(block: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        others, other_labels, alive = (array[block] for array in blocks)
 
-    start = (jnp.int32(0), valid, jnp.zeros(max_outputs, jnp.int32))
-    count, _, kept = lax.while_loop(unfinished, pick, start)
-    return kept, jnp.arange(max_outputs) < count
+        def unfinished(state: tuple[Array, Array, Array, Array]) -> Array:
+            _, count, _, alive = state
+            return (count < max_outputs) & alive.any()
+
+        def compare(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            slot, count, kept, alive = state
+            best = jnp.argmax(alive).astype(jnp.int32)  # The boxes are ordered by score.
+            is_new = slot == count
+            kept = kept.at[slot].set(jnp.where(is_new, block * size + best, kept[slot]))
+            box, label = boxes[kept[slot]], labels[kept[slot]]
+            rivals = _overlaps(box, others, threshold, vertical) & (other_labels == label)
+            alive = (alive & ~rivals).at[best].min(~is_new)  # A kept box is no candidate any more.
+            return slot + 1, count + is_new, kept, alive
+
+        _, count, kept, _ = lax.while_loop(unfinished, compare, (jnp.int32(0), *state, alive))
+        return count, kept
+
+    start = jnp.int32(0), jnp.zeros(max_outputs, jnp.int32)
+    count, kept = lax.fori_loop(0, _num_blocks(valid), within, start)
+    used = jnp.arange(max_outputs) < count
+    return jnp.where(used, order[kept], 0), used
 
 
 def _by_matrix(
