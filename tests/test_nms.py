@@ -119,7 +119,8 @@ def test_exported_programs_use_the_form_of_their_platform():
         for platforms in (("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda"))
     }
     texts = {platforms: program.mlir_module() for platforms, program in programs.items()}
-    # Rows have a loop in a loop, the matrix has one, and NVIDIA's plugin adds one. The matrix of overlaps identifies the matrix form.
+    # Rows have a loop in a loop, the matrix has one, and NVIDIA's plugin adds one. The matrix of overlaps
+    # identifies the matrix form.
     loops = {platforms: text.count("stablehlo.while") for platforms, text in texts.items()}
     matrices = [platforms for platforms, text in texts.items() if "tensor<70x70xi1>" in text]
     cuda = 2 if jax.default_backend() == "gpu" else 1

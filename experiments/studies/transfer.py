@@ -4,7 +4,7 @@
     python -m experiments.studies.transfer --checkpoint RUN --only simulated
     python -m experiments.studies.transfer --data FOLDER --only fine_tuning
     python -m experiments.studies.transfer --data FOLDER --only simulated --no-second-look --out without.json
-    python -m experiments.studies.transfer --data FOLDER --mirrored --out experiments/results/transfer_mirrored.json
+    python -m experiments.studies.transfer --data FOLDER --mirrored --out mirrored.json
 
 FOLDER contains ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_scene0103/`` (two keyframes of
 another) and ``nuscenes_scene0061/`` (one of a third). The simulated keyframes are of unseen drives, as written by
