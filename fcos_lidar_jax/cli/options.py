@@ -10,6 +10,7 @@ import tyro
 from fcos_lidar_jax import inference, sensors
 from fcos_lidar_jax.cli import sinks
 from fcos_lidar_jax.inference.alignment import Alignment, align
+from fcos_lidar_jax.progress import tell
 
 
 def option(metavar: str | None = None, *, default: str | None = None, text: str | None = None) -> Any:
@@ -133,6 +134,8 @@ def radians(degrees: float | None) -> float | None:
     """The angle of ``yaw_deg`` in radians; None stays None."""
     if degrees is not None and not math.isfinite(degrees):
         raise ValueError(f"--yaw-deg: got {degrees:g}, expected an angle in degrees")
+    if degrees and abs(degrees - (octants := round(degrees * 4 / math.pi)) * math.pi / 4) < 0.005:
+        tell(f"note: --yaw-deg {degrees:g} is in degrees; are {45 * octants} meant?", once=True)
     return None if degrees is None else math.radians(degrees)
 
 

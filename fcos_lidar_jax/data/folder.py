@@ -24,6 +24,7 @@ from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
 from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import PRESETS, Sensor, load_sensor
 
 _SENSOR, _CLASSES = "sensor.json", "classes.json"
@@ -182,9 +183,14 @@ class FolderFrames(FrameSet):
             if not classes or len(set(classes)) < len(classes):
                 raise ValueError(f"{file}: got {len(classes)} names, expected at least one, each once")
             return tuple(classes), {}
-        records = (record for file in self._boxes.values() for record in read_json(file, _Annotation).boxes)
-        labels = {classes.get(record.label, record.label) for record in records}
-        return tuple(sorted(label for label in labels if label is not None)), classes
+        given = {r.label for boxes in self._boxes.values() for r in read_json(boxes, _Annotation).boxes}
+        if unused := classes.keys() - given:
+            tell(
+                f"note: {file}: no box has the label {min(unused)!r}; labels: {', '.join(sorted(given))}",
+                once=True,
+            )
+        names = {classes.get(label, label) for label in given}
+        return tuple(sorted(name for name in names if name is not None)), classes
 
 
 def sensor_file(path: Path) -> Path | None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 import shutil
 import warnings
@@ -18,6 +19,7 @@ from tiny_run import CONFIG, NETWORK_OPTIONS, untrained
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax import cli, progress
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
 from fcos_lidar_jax.evaluation.records import cloud_record
@@ -316,3 +318,19 @@ def test_the_sensor_of_own_data_is_used_for_their_files(tmp_path, capsys):
     [evaluated] = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
     assert evaluated["boxes"] == expected
     assert fcos.load_detector("small")(data / "clouds" / "000.npy").to_dict()["boxes"] == expected
+
+
+@pytest.mark.parametrize(
+    ("degrees", "note"),
+    [
+        (1.5708, "note: --yaw-deg 1.5708 is in degrees; are 90 meant?\n"),
+        (-0.785, "note: --yaw-deg -0.785 is in degrees; are -45 meant?\n"),
+        (90.0, ""),
+        (1.5, ""),
+        (0.0, ""),
+        (None, ""),
+    ],
+)
+def test_an_angle_in_radians_is_told(degrees, note, capsys):
+    assert options.radians(degrees) == (None if degrees is None else math.radians(degrees))
+    assert capsys.readouterr().err == note

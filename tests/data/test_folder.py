@@ -67,13 +67,16 @@ def test_the_sensor_can_be_a_preset_or_an_argument(root):
     assert FolderFrames(root, TINY).frame(1).points[0, 3] == 30
 
 
-def test_labels_are_translated_or_dropped(root):
-    write(root / "classes.json", {"lorry": "truck", "sign": None, "car": "bus"})
+def test_labels_are_translated_or_dropped(root, capsys):
+    write(root / "classes.json", {"lorry": "truck", "sign": None, "car": "bus", "lory": "truck"})
     box = [*CAR["box"][:6], 0.25 + 4 * np.pi, None, None]  # two turns too many, and an unknown velocity
     records = [{"label": label, "box": box} for label in ("sign", "lorry", "car", "barrier")]
     write(root / "boxes" / "b.json", {"boxes": records})
     frames = FolderFrames(root, reading=ALL)
     assert frames.classes == ("barrier", "bus", "truck")
+    assert (
+        "classes.json: no box has the label 'lory'; labels: barrier, car, lorry, sign\n" in capsys.readouterr().err
+    )
     assert [frames.classes[i] for i in frames.frame(1).labels] == ["truck", "bus", "barrier"]
     boxes = frames.frame(1).boxes
     assert np.isnan(boxes[:, 7:]).all()
