@@ -259,8 +259,8 @@ def _by_rows(
             kept = kept.at[slot].set(jnp.where(is_new, block * size + best, kept[slot]))
             box, label = boxes[kept[slot]], labels[kept[slot]]
             rivals = _overlaps(box, others, threshold, vertical) & (other_labels == label)
-            alive = (alive & ~rivals).at[best].min(~is_new)  # A kept box is no candidate any more.
-            return slot + 1, count + is_new, kept, alive
+            alive &= ~rivals
+            return slot + 1, count + is_new, kept, alive.at[best].set(alive[best] & ~is_new)
 
         _, count, kept, _ = lax.while_loop(unfinished, compare, (jnp.int32(0), *state, alive))
         return count, kept

@@ -60,21 +60,34 @@ def crop_points(
     half = jnp.minimum(boxes[:, 3:6], limit_m) / 2 + margin_m
     frame = jnp.cos(boxes[:, 6]), jnp.sin(boxes[:, 6])
 
-    # Bit b of word w tells whether row 32 w + b is inside: a bit per point is faster to count than a byte. Words
-    # are the last axis, so that XLA tests and packs many of them at once.
     position = jnp.where(usable[:, None], points[:, :3], _FAR_M).reshape(num_words, _WORD, 3)
-    bit_major = [position[..., i].T for i in range(3)]
-    local = _to_frame(bit_major, boxes[:, None, None], [f[:, None, None] for f in frame])
-    within = [jnp.abs(d) < half[:, None, None, i] for i, d in enumerate(local)]
-    inside = within[0] & within[1] & within[2]  # not a stack of three, which XLA would write to memory
-    words = (inside.astype(jnp.uint32) << lax.iota(jnp.uint32, _WORD)[:, None]).sum(axis=1, dtype=jnp.uint32)
-    row, count = _first_set_bits(words, num_points)
+    row, count = _first_set_bits(_inside(position, boxes, half, frame), num_points)
     taken = jnp.arange(num_points) < count[:, None]
     row = jnp.where(taken, row, 0)
     chosen = points[row]
     local = _to_frame([chosen[..., i] for i in range(3)], boxes[:, None], [f[:, None] for f in frame])
     chosen = jnp.concatenate([jnp.stack(local, axis=-1), chosen[..., 3:]], axis=-1)
     return Crops(jnp.where(taken[..., None], chosen, 0.0), jnp.where(taken, order[row], -1), count)
+
+
+def _inside(position: Array, boxes: Array, half: Array, frame: tuple[Array, Array]) -> Array:
+    """Words u32[m, w]: bit b of word w tells whether position [w, b] is inside of a box.
+
+    A bit per point is faster to count than a byte. Bits are combined without a reduction, and words are the last
+    axis, so that XLA tests and packs many words at once; a loop over the bytes keeps the program small.
+    """
+    by_bit = [position[..., i].T.reshape(_WORD // 8, 8, -1) for i in range(3)]
+    sides = [half[:, i : i + 1] for i in range(3)]
+
+    def add_byte(byte: Array, words: Array) -> Array:
+        bits = jnp.zeros_like(words)
+        for bit in range(8):
+            local = _to_frame([axis[byte, bit] for axis in by_bit], boxes[:, None], [f[:, None] for f in frame])
+            x, y, z = (jnp.abs(d) < side for d, side in zip(local, sides, strict=True))
+            bits |= (x & y & z).astype(jnp.uint32) << bit
+        return words | bits << (8 * byte).astype(jnp.uint32)
+
+    return lax.fori_loop(0, _WORD // 8, add_byte, jnp.zeros((boxes.shape[0], position.shape[0]), jnp.uint32))
 
 
 def _to_frame(xyz: list[Array], boxes: Array, frame: list[Array]) -> list[Array]:
