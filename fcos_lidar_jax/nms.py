@@ -18,7 +18,7 @@ from fcos_lidar_jax.iou import oriented, oriented_overlap
 from fcos_lidar_jax.types import check_rows
 
 _Members = Callable[[Array, Array, tuple[Array, ...]], tuple[Array, Array]]
-_BLOCK = 1024  # Boxes that are compared with a kept box at once; blocks without valid boxes are skipped.
+_BLOCK = 512  # Boxes that are compared with a kept box at once; blocks without valid boxes are skipped.
 _MAX_TURN_RAD = np.pi / 3  # Merged boxes must agree on the heading within this angle.
 
 
@@ -259,8 +259,9 @@ def _by_rows(
             kept = kept.at[slot].set(jnp.where(is_new, block * size + best, kept[slot]))
             box, label = boxes[kept[slot]], labels[kept[slot]]
             rivals = _overlaps(box, others, threshold, vertical) & (other_labels == label)
-            alive &= ~rivals
-            return slot + 1, count + is_new, kept, alive.at[best].set(alive[best] & ~is_new)
+            # Elementwise, because a scatter would be fused with the comparison, which is slower.
+            alive &= ~rivals & ~(is_new & (lax.iota(jnp.int32, size) == best))
+            return slot + 1, count + is_new, kept, alive
 
         _, count, kept, _ = lax.while_loop(unfinished, compare, (jnp.int32(0), *state, alive))
         return count, kept
