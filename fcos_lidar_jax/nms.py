@@ -199,7 +199,8 @@ def _merged_by_rows(
         return lax.fori_loop(0, used.sum(), add, sums)
 
     nothing = jnp.zeros_like(kept_boxes), jnp.zeros_like(kept_boxes[:, 0])
-    return _moved(kept_boxes, *lax.fori_loop(0, _num_blocks(usable), within, nothing), used)
+    shift, weight = lax.fori_loop(0, _num_blocks(usable), within, nothing)
+    return _moved(kept_boxes, shift, weight, used)
 
 
 def _merged_by_matrix(
