@@ -8,6 +8,7 @@ import mmap
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
@@ -130,7 +131,7 @@ def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) 
         raise ValueError(f"{path}: no such file, expected the table")
     if path.stat().st_size == 0:
         raise ValueError(f"{path}: empty file, expected a JSON list")
-    decoder = msgspec.json.Decoder(list[kind])
+    decoder = msgspec.json.Decoder[list[R]](GenericAlias(list, kind))
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text:
         num_rows = 0
         for first, last in _pieces(text, piece_bytes):
