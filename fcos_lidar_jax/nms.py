@@ -117,7 +117,7 @@ def merge_boxes(
         return jnp.zeros((*kept.shape, boxes.shape[1]), jnp.float32)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
-    members = functools.partial(_members, threshold=iou_threshold, vertical=_is_vertical(overlap))
+    members = functools.partial(_sum_members, threshold=iou_threshold, vertical=_is_vertical(overlap))
     arrays = jnp.asarray(boxes, jnp.float32), weights, labels, usable, kept, used
     rows, matrix = (functools.partial(merge, members) for merge in (_merged_by_rows, _merged_by_matrix))
     return in_form(form, {"rows": rows, "matrix": matrix}, *arrays, cpu="rows", default="matrix")
@@ -161,7 +161,7 @@ def _is_vertical(overlap: str) -> bool:
     return overlap == "3d"
 
 
-def _members(
+def _sum_members(
     box: Array, label: Array, candidates: tuple[Array, ...], *, threshold: float, vertical: bool
 ) -> tuple[Array, Array]:
     """Sums of the weighted offsets, c, and of the weights of the candidates that a box is merged with."""

@@ -71,7 +71,7 @@ def crop_points(
 
 
 def _inside(position: Array, boxes: Array, half: Array, frame: tuple[Array, Array]) -> Array:
-    """Words u32[m, w]: bit b of word w tells whether position [w, b] is inside of a box.
+    """Words u32[m, w]: bit b of word w tells whether position [w, b] is inside of the box.
 
     A bit per point is faster to count than a byte. Bits are combined without a reduction, and words are the last
     axis, so that XLA tests and packs many words at once; a loop over the bytes keeps the program small.

@@ -219,16 +219,18 @@ def test_fine_tuning_trains_the_network_and_keeps_the_augmentation_of_its_checkp
     monkeypatch.setattr(
         transfer, "trained", lambda folder, config, *_, **options: runs.append((folder, config, options))
     )
-    monkeypatch.setattr(transfer, "applied", lambda *_: None)
-    monkeypatch.setattr(transfer, "measured", lambda *_: {})
+    monkeypatch.setattr(transfer, "applied", lambda args, _: args.mirrored)
+    monkeypatch.setattr(transfer, "measured", lambda changed, _: {"mirrored": changed})
     weights = tmp_path / "weights"
     given = change(augment=AugmentConfig(flip_y_probability=0.0))(CONFIG)
     for value in (0.0, 1.0):
         variables = jax.tree.map(lambda leaf, v=value: leaf + np.float32(v), untrained(CONFIG, TINY))
         shutil.rmtree(weights, ignore_errors=True)
         save_checkpoint(weights, Checkpoint(given, TINY, variables, 3))
-        records = list(transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=weights, work=tmp_path)))
+        args = transfer.Args(data=tmp_path, checkpoint=weights, work=tmp_path, mirrored=bool(value))
+        records = list(transfer.fine_tuning(args))
         assert len(records) == 2
+        assert records[1]["from scratch"] == {"mirrored": bool(value)}  # options of detection apply here, too
     assert len({folder for folder, _, _ in runs}) == 4
     assert all(config.model == given.model for _, config, _ in runs)
     assert all(config.augment == given.augment for _, config, _ in runs)
