@@ -92,6 +92,7 @@ TRIALS: dict[str, Change] = {
     "larger": change(**_LARGER),
     "larger, without local geometry": change(**_LARGER, model__local_geometry=False),
     MARKED: change(**_LARGER, projection__num_rounds=2),
+    "local geometry, joint": change(refinement=_LOOK),
     "larger, joint": change(**_LARGER, refinement=_LOOK),
 }
 TRIALS |= {name: lambda config, first=first: _FROZEN(TRIALS[first](config)) for name, first in AFTERWARDS.items()}
