@@ -34,7 +34,7 @@ _WEAK_AP, _WEAK_BOXES = 0.05, 10
 class Args:
     """Options of the model card."""
 
-    name: Literal["quickstart", "hdl32e"]  # Name of the weights.
+    name: Literal["quickstart", "hdl32e", "hdl64e"]  # Name of the weights.
     results: Path = RESULTS  # Folder of the figures.
 
 

@@ -4,9 +4,10 @@
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --export
     python -m experiments.studies.shipped_weights --name quickstart  # scores the weights in the package
 
-``hdl32e`` is the preset ``compact`` for nuScenes' sensor, ``quickstart`` the preset of the same name. Both are
-trained on simulated streets only, by default each frame on another street. The training runs at low priority and
-saves every few minutes; the same command resumes it with bit-identical results.
+``hdl32e`` is the preset ``compact`` for nuScenes' sensor, ``hdl64e`` the preset ``kitti_compact`` for the view of
+KITTI's camera, ``quickstart`` the preset of the same name. All are trained on simulated streets only, by default
+each frame on another street. The training runs at low priority and saves every few minutes; the same command
+resumes it with bit-identical results.
 
 ``--export`` does not train: it writes the averaged weights of the newest checkpoint into the package as float16,
 scores them on unseen frames, and writes ``experiments/results/NAME.json`` and the model card; a training may run
@@ -57,15 +58,18 @@ from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
+from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models import count_parameters
-from fcos_lidar_jax.presets import COMPACT, QUICKSTART
+from fcos_lidar_jax.presets import COMPACT, KITTI_COMPACT, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, fresh_streets
 from fcos_lidar_jax.simulation.streets import CITY
@@ -83,6 +87,12 @@ CONFIGS = {
         optimizer__warmup_fraction=0.2,
         refinement__first_score_weight=0.5,  # better in real sweeps, see ``experiments/LOG.md``, 2026-11-28
     )(_FRESH(COMPACT)),
+    # Simulated streets have y ahead.
+    "hdl64e": change(
+        augment__flip_x_probability=0.5,
+        augment__flip_y_probability=0.0,
+        optimizer__warmup_fraction=0.2,
+    )(_FRESH(KITTI_COMPACT)),
 }
 EVEN_CITY = dataclasses.replace(CITY, name="city, more even", city_classes=0.25)
 """At the frequencies of a city, most classes would hardly occur; here each has at least a tenth of the mean."""
@@ -115,7 +125,7 @@ _KEPT = 50  # Checkpoints of a run without evaluations.
 class Args(Options):
     """Options of the weights."""
 
-    name: Literal["quickstart", "hdl32e"]  # Weights to train or score.
+    name: Literal["quickstart", "hdl32e", "hdl64e"]  # Weights to train or score.
     work: Path | None = None  # Folder of the training run; default: score the weights in the package.
     steps: int = 20_000  # Updates of the whole run.
     seed: int = 1  # Seed of weights and streets; the demo trains with 0.
@@ -150,7 +160,10 @@ def streets(config: Config, *, steps: int, seed: int) -> tuple[FrameSet, FrameSe
     if unseen.streets != CITY:
         return shown, unseen
     matt = dataclasses.replace(shown, num_objects=_MORE_OBJECTS, streets=EVEN_CITY)
-    return MixedFrames(dataclasses.replace(matt, streets=TRAINING_CITY), matt, _MATT_PERIOD), unseen
+    mixed = MixedFrames(dataclasses.replace(matt, streets=TRAINING_CITY), matt, _MATT_PERIOD)
+    if config.classes == NUSCENES_CLASSES:
+        return mixed, unseen
+    return MappedFrames(mixed, config.classes, TO_KITTI), MappedFrames(unseen, config.classes, TO_KITTI)
 
 
 def train(args: Args, work: Path) -> dict[str, Any]:
