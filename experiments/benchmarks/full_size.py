@@ -2,7 +2,6 @@
 
     python -m experiments.benchmarks.full_size --data FOLDER  # on the real keyframe of scene-0061
     python -m experiments.benchmarks.full_size  # on a simulated frame
-    python -m experiments.benchmarks.full_size --preset compact --weights hdl32e  # with and without second look
     python -m experiments.benchmarks.full_size --memory-only --out experiments/results/training_memory.json
 
 ``latency.py`` times the detection. Cost: about three minutes on two CPU cores and 10 GB. Expected: 10.66 M
@@ -15,19 +14,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 
-from experiments.benchmarks.training_steps import training_steps
 from experiments.hardware import peak_memory_gib
-from experiments.keyframe import read_keyframe
+from experiments.real_frames import read_keyframe
+from experiments.runs import training_steps
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.timing import interleaved
+from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.refinement import without_second_look
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
@@ -40,7 +37,6 @@ class Args(Options):
     """Options of the measurement."""
 
     preset: Literal["nuscenes", "nuscenes_single", "compact", "quickstart"] = "nuscenes"  # Configuration preset.
-    weights: Path | None = None  # Trained weights, whose boxes a second look sees; default: random weights.
     data: Path | None = None
     """Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated frame."""
     repeats: int = 5  # Timed steps, for the median.
@@ -55,11 +51,8 @@ def training_memory(config: Config) -> dict[str, dict[str, float]]:
     and batch.
     """
     sensor, found = load_sensor(config.sensor), {}
-    points, boxes = (1, config.max_points), (1, config.max_boxes)
-    shapes = (*points, sensor.point_columns), points, (*boxes, 9), boxes, boxes
-    types = jnp.float32, jnp.bool_, jnp.float32, jnp.int32, jnp.bool_
-    arrays: list[Any] = list(map(jax.ShapeDtypeStruct, shapes, types))
-    batch = Batch(*arrays)
+    frame = make_frame(0, sensor, reading=cut_reading(1))
+    batch = make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes)
     for remat in (False, True):
         model = dataclasses.replace(config.model, remat=remat)
         detector = build_detector(dataclasses.replace(config, model=model), sensor)
@@ -88,14 +81,7 @@ def measure(args: Args) -> dict[str, Any]:
     reading = cut_reading(1)
     frame = read_keyframe(folder, sensor, reading=reading) if folder else make_frame(0, sensor, reading=reading)
     shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
-    # In NumPy, because each step gives its arrays away.
-    variables = None if args.weights is None else jax.device_get(load_trained(args.weights).variables)
-    calls = {"train step": training_steps(config, sensor, [frame], variables)}
-    if config.refinement is not None:
-        alone = dataclasses.replace(config, refinement=None)
-        own = None if variables is None else without_second_look(variables)
-        calls["train step without second look"] = training_steps(alone, sensor, [frame], own)
-    times = interleaved(calls, args.repeats)
+    times = interleaved({"train step": training_steps(config, sensor, [frame])}, args.repeats)
     return {
         "preset": config.name,
         "frame": "scene-0061, real" if folder else "simulated",

@@ -55,12 +55,6 @@ def kept_by_rounds(
         ``in_range`` and ``in_view``, points within the sensor's limits and, of those, in its field of view; for
         ``prioritized`` and ``not prioritized``, by rounds: ``kept``, ``percent`` of those in range, ``current`` of
         the kept.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
-    >>> found = kept_by_rounds(cloud, TINY, rounds=(1, 2))
-    >>> found["prioritized"]["kept"], found["prioritized"]["current"], found["not prioritized"]["current"]
-    ({'1': 1, '2': 2}, {'1': 1, '2': 1}, {'1': 0, '2': 1})
     """
     valid = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, CloudReading(remove_close=close)))
     (low, high), z = sensor.limit_z_m, points[:, 2]
@@ -82,13 +76,7 @@ def kept_by_rounds(
 
 
 def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[str, dict[str, float]]]:
-    """Average :func:`kept_by_rounds` over clouds.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
-    >>> mean_kept([cloud, cloud * np.float32([[1], [99]])], TINY)["prioritized"]["percent"]["1"]
-    75.0
-    """
+    """Average :func:`kept_by_rounds` over clouds."""
     found = [kept_by_rounds(cloud, sensor) for cloud in clouds]
     return {
         name: {
