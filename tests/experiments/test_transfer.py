@@ -4,17 +4,19 @@ import dataclasses
 import json
 import math
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from linear_network import linear_network
 from tiny_run import TINY_CONFIG, untrained
 
 from experiments.changes import change
 from experiments.real_frames import SPANS_M, scores_by_range, within
 from experiments.studies import model_card, shipped_weights, transfer
-from experiments.studies.shipped_weights import with_adjusted_logits
+from experiments.studies.shipped_weights import MixedFrames, with_adjusted_logits
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.data.frame import Frame
@@ -50,12 +52,17 @@ def test_a_span_holds_the_boxes_of_its_distances(near, far):
     for before, after, d, e in zip(frames, rest, found, chosen, strict=True):
         distances = [math.sqrt(float(x) ** 2 + float(y) ** 2) for x, y in before.boxes[:, :2]]
         kept = [i for i, distance in enumerate(distances) if near <= distance < far]
-        np.testing.assert_array_equal(after.boxes, before.boxes[kept])
-        np.testing.assert_array_equal(after.labels, before.labels[kept])
-        np.testing.assert_array_equal(after.num_points, before.num_points[kept])
+        for name in ("boxes", "labels", "num_points"):
+            np.testing.assert_array_equal(getattr(after, name), getattr(before, name)[kept])
         for i, box in enumerate(d.boxes):
             inside = near <= math.sqrt(float(box[0]) ** 2 + float(box[1]) ** 2) < far
             assert e.valid[i] == (d.valid[i] and inside)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _linear() -> Iterator[None]:
+    with linear_network():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +102,6 @@ def shipped(exported, tmp_path, monkeypatch):
 def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
     package, record = shipped
     exported, run = (load_checkpoint(p) for p in (package / "hdl32e", tmp_path / "run/checkpoints/00000003"))
-    run = with_adjusted_logits(run, 0.5)
     for a, b in zip(*(jax.tree.leaves(c.variables) for c in (exported, run)), strict=True):
         assert a.dtype == np.float32
         np.testing.assert_array_equal(a, np.asarray(b).astype(np.float16).astype(np.float32))
@@ -110,14 +116,23 @@ def test_every_third_training_street_has_matt_cars_like_the_tests():
     assert [frames.streets.gloss for frames in (shown.frames, shown.other, unseen)] == [1, 0, 0]
 
 
+def test_frames_of_two_sets_are_mixed():
+    first, other = SimulatedFrames(TINY, 4), SimulatedFrames(TINY, 4, num_objects=3)
+    mixed = MixedFrames(first, other, 3)
+    for index in range(4):
+        expected = (first if index % 3 else other).frame(index)
+        assert (mixed.frame(index).points == expected.points).all()
+        assert (mixed.truth(index).boxes == expected.boxes).all()
+        assert mixed.labels(index).tolist() == expected.labels.tolist()
+    assert (len(mixed), mixed.name(3)) == (4, first.name(3))
+
+
 def test_logits_are_adjusted_for_the_class_frequencies_of_nuscenes():
     """Closed form: the training's frequencies are nuScenes' to the power of 0.25, up to a constant factor."""
-    before = Checkpoint(CONFIG, TINY, untrained(CONFIG, TINY), 1)
-    after = with_adjusted_logits(before, 0.4)
-    old, new = (dict(jax.tree_util.tree_leaves_with_path(c.variables)) for c in (before, after))
-    changed = {path: new[path] - old[path] for path in old if not np.array_equal(old[path], new[path])}
-    assert [path[-1].key for path in changed] == ["logits_bias"]  # the tiny network has one head for all levels
-    ((*classes, background),) = changed.values()
+    weights = {"heads": {"logits_bias": np.zeros(11), "iou_bias": np.zeros(1)}}
+    after = with_adjusted_logits(Checkpoint(CONFIG, TINY, weights, 1), 0.4).variables["heads"]
+    assert after["iou_bias"] == 0
+    *classes, background = after["logits_bias"]
     nuscenes = np.array([0.36, 0.08, 0.02, 0.04, 0.015, 0.17, 0.015, 0.02, 0.09, 0.19])
     slopes = np.array(classes) - 0.4 * 0.75 * np.log(nuscenes)
     np.testing.assert_allclose(slopes, slopes.mean(), atol=1e-6)
@@ -127,34 +142,21 @@ def test_logits_are_adjusted_for_the_class_frequencies_of_nuscenes():
 
 
 @pytest.mark.slow
-def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path, monkeypatch):
-    package, scored = shipped
-
-    def scores(_):
-        written = json.loads((package / "hdl32e" / "checkpoint.json").read_text())
-        return {name: scored[name] for name in SCORES} | {"hash": written["hash"]}
-
-    monkeypatch.setattr(shipped_weights, "scores", scores)
+def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path):
+    package, _ = shipped
     run = load_checkpoint(tmp_path / "run/checkpoints/00000003")
     other = jax.tree.map(lambda leaf: np.asarray(leaf) + np.float32(1), run.variables)
     earlier = save_and_hash(tmp_path / "earlier", dataclasses.replace(run, variables=other))
     args = shipped_weights.Args(name="hdl32e", work=tmp_path / "run", export=True, test_frames=2)
-    args = dataclasses.replace(args, average=tmp_path / "earlier", average_share=0.25)
-    shipped_weights.main(args)
-    both = (load_checkpoint(package / "hdl32e").variables, with_adjusted_logits(run, 0.75 * 0.5).variables)
-    for a, b in zip(*map(jax.tree.leaves, both), strict=True):
-        np.testing.assert_allclose(a, np.asarray(b, np.float32) + 0.25, rtol=1e-3, atol=1e-4)
+    shipped_weights.main(dataclasses.replace(args, average=tmp_path / "earlier"))
+    for a, b in zip(
+        *map(jax.tree.leaves, (load_checkpoint(package / "hdl32e").variables, run.variables)), strict=True
+    ):
+        np.testing.assert_allclose(a, np.asarray(b, np.float32) + 0.3, rtol=1e-3, atol=1e-4)
     record = json.loads((tmp_path / "results/hdl32e.json").read_text())
-    assert record["training"]["averaged_with"] == {"hash": earlier, "share": 0.25}
-    wrong = {
-        "--average-share: got 1.5": {"average_share": 1.5},
-        "--average: only for --export": {"export": False},
-        "--average-share: only with --average": {"average": None},
-        "--average: got another network": {"average": Path("hdl32e")},
-    }
-    for message, change_of in wrong.items():
-        with pytest.raises(ValueError, match=message):
-            shipped_weights.main(dataclasses.replace(args, **change_of))
+    assert record["training"]["averaged_with"] == {"hash": earlier, "share": 0.3}
+    with pytest.raises(ValueError, match="--average: got another network"):
+        shipped_weights.averaged(run, dataclasses.replace(run, variables={"params": {"a": np.zeros(3)}}))
 
 
 def save_and_hash(folder: Path, checkpoint: Checkpoint) -> str:
@@ -171,11 +173,6 @@ def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     scored = json.loads(args.out.read_text())
     assert {name: scored[name] for name in SCORES} == {name: record[name] for name in SCORES}
     assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
-    for option in ({"export": True}, {"seed": 7}, {"warm_start": tmp_path}):
-        with pytest.raises(
-            ValueError, match=r"--(export|seed|warm-start): only for a training, expected its folder"
-        ):
-            shipped_weights.main(dataclasses.replace(args, **option))
     # Scores alone are no training to go on from, nor to write a card of; nothing is overwritten.
     results = tmp_path / "results"
     args.out.rename(results / "hdl32e.json")
