@@ -151,7 +151,7 @@ def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: s
     """Load a padded cloud from files."""
     number = 1 if setting == "single" else 10
     points, num_close = drive.fuse_sweeps(token, CloudReading(number, "all", config.projection.close_m))
-    config = dataclasses.replace(config, max_points=ROWS[setting])
+    config = dataclasses.replace(config, max_points=ROWS[setting], num_sweeps=number)
     return make_cloud(points, config, sensor=sensor, num_close=num_close).points
 
 

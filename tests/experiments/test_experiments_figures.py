@@ -6,7 +6,8 @@ import pytest
 from experiments.benchmarks import latency, mrv_figures
 from experiments.paper import PAPER
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 
 ROWS = {name: table["rows"] for name, table in PAPER["tables"].items()}
 
@@ -39,6 +40,13 @@ def test_counts_of_a_small_cloud():
     assert found["prioritized"]["current"] == {"1": 1, "2": 1, "5": 1}
     assert found["not prioritized"]["current"] == {"1": 0, "2": 0, "5": 1}
     assert found["prioritized"]["percent"] == {"1": 33.33, "2": 66.67, "5": 100.0}
+
+
+def test_ten_sweeps_are_loaded_for_a_preset_of_one():
+    with latency.simulated_sweeps(TINY) as (drive, token):
+        points = latency.load(drive, token, QUICKSTART, TINY, "multi")
+    assert len(points) == latency.ROWS["multi"]
+    assert len(np.unique(points[:, 4])) == 10
 
 
 def test_times_have_every_row_and_ratios_to_the_first(monkeypatch):
