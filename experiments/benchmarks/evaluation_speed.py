@@ -94,7 +94,7 @@ def _scene(rng: np.random.Generator, index: int, names: list[str], keyframes: in
     boxes[..., :3] = start + np.arange(keyframes)[:, None, None] * step
     boxes[..., 3:6] = rng.uniform(0.5, 4.5, (len(names), 3))
     boxes[..., 6] = rng.uniform(-np.pi, np.pi, len(names))
-    attributes = [rng.choice(CLASS_ATTRIBUTES[name] or (None,)) for name in names]
+    attributes = [next(iter(CLASS_ATTRIBUTES[name]), None) for name in names]
     counts = rng.integers(0, 40, shape)
     counts[[0, -1]] += 1  # annotations are from the first to the last point
     objects = [CATEGORIES[name] for name in names], boxes, [attributes] * keyframes, np.ones(shape), counts
