@@ -2,21 +2,18 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fcos_lidar_jax import __version__
-from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames, no_points, without_points
+from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.progress import tell
 
-_DESCRIPTION = "frames.json"
-_TRUTH = ("boxes", "labels", "num_points")
-_FRAME = (*_TRUTH, "points", "num_close")
+_FRAME = ("boxes", "labels", "num_points", "points", "num_close")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,13 +21,11 @@ class CachedFrames(WrappedFrames):
     """A frame set that makes every frame once and keeps it on disk.
 
     The folder contains ``frames.json``, which describes the frame set, and one ``.npz`` archive per requested
-    frame; one with another set's frames is refused at construction. Threads and processes may share the folder,
-    since files appear whole. A damaged file is made again, with a warning on standard error. Changed code of the
-    same version goes unnoticed: delete the folder then.
+    frame. Threads and processes may share the folder, since files appear whole. A damaged file is made again, with
+    a warning on standard error. Changed code of the same version goes unnoticed: delete the folder then.
 
     Raises:
         ValueError: at construction, if the folder contains another set's frames.
-        OSError: a file cannot be written.
     """
 
     frames: FrameSet  # a dataclass with fields that JSON can represent
@@ -38,41 +33,22 @@ class CachedFrames(WrappedFrames):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        own, file = _description(self.frames), self.folder / _DESCRIPTION
-        if self.folder.exists() and not self.folder.is_dir():
-            raise ValueError(f"{self.folder}: found a file, expected a folder")
-        # Listed before the description is looked for: another process may begin the same cache at this moment.
-        archives = sorted(p.name for p in self.folder.glob("*.npz") if not p.name.startswith("."))
+        own, file = _description(self.frames), self.folder / "frames.json"
         if not file.is_file():
-            if archives:
-                problem = f"found {archives[0]} without {_DESCRIPTION}, expected a new folder"
-                raise ValueError(f"{self.folder}: {problem}")
             atomic_write(file, lambda path: path.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8"))
         stored = read_json(file, dict[str, Any])
         for name in {**own, **stored}:
-            if name not in own or name not in stored or own[name] != stored[name]:
-                values = (record.get(name, "nothing") for record in (stored, own))
-                there, got = (v["name"] if isinstance(v, dict) and "name" in v else v for v in values)  # sensors
-                raise ValueError(f"{file}: {name}: found {there}, expected {got}: this folder keeps other frames")
+            if own.get(name) != stored.get(name):
+                raise ValueError(f"{file}: found frames with another {name}: choose another folder")
 
     def frame(self, index: int) -> Frame:
-        if (arrays := self._read(index, _FRAME)) is not None:
-            num_close = int(arrays.pop("num_close"))
-            return Frame(**arrays, num_close=num_close)
-        frame = self.frames.frame(index)
-        atomic_write(
-            self._file(index), lambda path: np.savez(path, **{name: getattr(frame, name) for name in _FRAME})
-        )
+        if (frame := self._read(index)) is None:
+            frame = self.frames.frame(index)
+            arrays = {name: getattr(frame, name) for name in _FRAME}
+            atomic_write(self._file(index), lambda path: np.savez(path, **arrays))
         return frame
 
-    def truth(self, index: int) -> Frame:
-        """:meth:`frame` without its points; makes and writes the whole frame if there is no file yet."""
-        arrays = self._read(index, _TRUTH)
-        if arrays is None:
-            return without_points(self.frame(index))
-        return Frame(no_points(self.sensor), **arrays)
-
-    labels = FrameSet.labels
+    truth, labels = FrameSet.truth, FrameSet.labels  # of the cached frame
 
     def made(self) -> list[int]:
         """Indices of the frames in the folder, ascending."""
@@ -81,11 +57,12 @@ class CachedFrames(WrappedFrames):
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
 
-    def _read(self, index: int, names: Sequence[str]) -> dict[str, Any] | None:
-        """Arrays of a frame's file; None if the file is missing or damaged."""
+    def _read(self, index: int) -> Frame | None:
+        """A frame of the folder; None if its file is missing or damaged."""
         file = self._file(index)
         try:
-            return parse_npz(file.read_bytes(), names)
+            arrays = parse_npz(file.read_bytes(), _FRAME)
+            return Frame(**{**arrays, "num_close": int(arrays["num_close"])})
         except FileNotFoundError:
             return None
         except Exception as error:  # damaged archives raise arbitrary exceptions
@@ -96,13 +73,7 @@ class CachedFrames(WrappedFrames):
 
 def _description(frames: FrameSet) -> dict[str, Any]:
     """Everything that determines the frames, as JSON returns it."""
-    kind = type(frames)
-    if not dataclasses.is_dataclass(frames):
-        raise ValueError(f"frames: got {kind.__name__}, expected a dataclass")
-    try:
-        fields = json.loads(json.dumps(dataclasses.asdict(frames)))
-    except TypeError as error:
-        raise ValueError(f"frames: {kind.__name__}: expected fields that JSON can hold: {error}") from None
+    fields = json.loads(json.dumps(dataclasses.asdict(frames)))  # type: ignore[call-overload]
     if isinstance(sensor := fields.get("sensor"), dict):
         sensor.pop("forward_rad", None)  # changes no frame
-    return {"version": __version__, "kind": kind.__qualname__, **fields}
+    return {"version": __version__, "kind": type(frames).__qualname__, **fields}

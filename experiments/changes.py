@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.presets import COMPACT
 
 Change = Callable[[Config], Config]
 
@@ -39,5 +40,13 @@ SLIM = change(
     model__fpn_channels=48,
     model__head_channels=32,
 )
-"""Former sizes of ``compact``, without its second look. The ladder and the scale ``sector`` keep them, so that
-trials stay comparable."""
+"""Sizes of ``compact`` before 2026-11-27, without its second look. The ladder and the scale ``sector`` keep them,
+so that trials stay comparable."""
+LARGER = {
+    "model__stem__out_channels": COMPACT.model.stem.out_channels,
+    **{
+        f"model__{name}": getattr(COMPACT.model, name)
+        for name in ("backbone_blocks", "backbone_widths", "fpn_channels", "head_channels")
+    },
+}
+"""Fields that return to the sizes of ``compact`` today."""

@@ -14,17 +14,16 @@ The verdict follows from the 95 % interval of the gain over the seeds:
 """
 
 import dataclasses
-import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from experiments.benchmarks.latency import PAPER_STAGES
 from experiments.paper import PAPER
 from experiments.paper_tables.__main__ import TABLES
-from experiments.paper_tables.cells import changes_of, read_cells
+from experiments.paper_tables.cells import Cell, changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
-from experiments.paper_tables.tables import SCORES, Row, Table
+from experiments.paper_tables.tables import SCORES, Row
 from experiments.script import run_script, write_text
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
 from experiments.studies import mrv_ablations
@@ -60,12 +59,8 @@ class Figure:
     above: bool = False  # The paper states a lower bound.
 
 
-def _kept(rounds: int, column: str) -> Callable[[Any], float]:
-    return lambda d: d["kept"]["ten sweeps, with close points"]["prioritized"][column][str(rounds)]
-
-
-def _stem(variant: str) -> Callable[[Any], float]:
-    return lambda d: d["variants"][variant]["ratio"]
+def _kept(d: Any, column: str, rounds: int) -> float:
+    return d["kept"]["ten sweeps, with close points"]["prioritized"][column][str(rounds)]
 
 
 def _overall(d: Any, setting: str) -> float:
@@ -77,9 +72,9 @@ def _paper_ratio(table: str, row: str, reference: str) -> float:
     return rows[row]["time_ms"] / rows[reference]["time_ms"]
 
 
-FIGURES = (
-    Figure("Points that one round keeps, thousands", "mrv_figures", lambda d: _kept(1, "kept")(d) / 1000, 28),
-    Figure("Points that five rounds keep, %", "mrv_figures", _kept(5, "percent"), 50, above=True),
+FIGURES = [
+    Figure("Points that one round keeps, thousands", "mrv_figures", lambda d: _kept(d, "kept", 1) / 1000, 28),
+    Figure("Points that five rounds keep, %", "mrv_figures", lambda d: _kept(d, "percent", 5), 50, above=True),
     Figure(
         "Time of the projection, ten sweeps: seven rounds relative to one",
         "mrv_figures",
@@ -90,15 +85,15 @@ FIGURES = (
         Figure(
             f"Time of the stem: {row}, relative to nine groups of two convolutions",
             "module_latency",
-            _stem(variant),
-            _paper_ratio(table, key, reference),
+            lambda d, variant=variant: d["variants"][variant]["ratio"],
+            _paper_ratio(table, key, "9 groups" if table == "table3" else "2"),
         )
-        for row, variant, table, key, reference in (
-            ("one group", "one group", "table3", "1 group", "9 groups"),
-            ("five groups", "5 modalities", "table3", "5 groups", "9 groups"),
-            ("rounds not grouped", "9 types, rounds apart", "table3", "9 groups, rounds not grouped", "9 groups"),
-            ("one convolution", "1 convolution", "table4", "1", "2"),
-            ("three convolutions", "3 convolutions", "table4", "3", "2"),
+        for row, variant, table, key in (
+            ("one group", "one group", "table3", "1 group"),
+            ("five groups", "5 modalities", "table3", "5 groups"),
+            ("rounds not grouped", "9 types, rounds apart", "table3", "9 groups, rounds not grouped"),
+            ("one convolution", "1 convolution", "table4", "1"),
+            ("three convolutions", "3 convolutions", "table4", "3"),
         )
     ),
     Figure(
@@ -107,7 +102,17 @@ FIGURES = (
         lambda d: _overall(d, "multi") / _overall(d, "single"),
         1.0,
     ),
-)
+]
+
+
+class Claim(NamedTuple):
+    """A claim about accuracy: what a row gains over its reference."""
+
+    text: str
+    row: Row
+    reference: Row
+    paper: dict[str, float]  # Score -> gain in the paper.
+
 
 _WITH_OFFSETS = "five rounds of ten sweeps with round offsets"
 LOCAL_GEOMETRY = {
@@ -142,17 +147,6 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
 
     An undecided claim names the number of seeds with which the interval would separate the paper's gain from zero
     in about half of the cases, if further seeds have the same deviation.
-
-    >>> verdict([2.0, 2.1, 2.2], 1.9)
-    ('agrees', '')
-    >>> verdict([4.0, 4.1, 4.2], 1.9)[0]
-    'agrees only in direction'
-    >>> verdict([-2.0, -2.1, -2.2], 1.9)
-    ('disagrees', '')
-    >>> verdict([-1.0, 0.5, 2.0], 1.0)
-    ('undecided', '12 seeds')
-    >>> verdict([2.0, 2.1], 1.9)  # two seeds say nothing about their spread
-    ('undecided', 'more seeds')
     """
     bounds = interval(gains)
     if bounds is None or len(gains) < MIN_SEEDS:
@@ -165,17 +159,14 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     return "disagrees", ""
 
 
-def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str = "mAP") -> tuple[list[float], int]:
-    """Return a row's gains over its reference in points, one per seed with both cells, and the training
-    samples."""
-    config, reference = (r.change(scale.base) for r in (row, table.reference_of(row)))
-    by_changes, gains = read_cells(cells, scale), list[float]()
-    changes = [changes_of(c, scale.base) for c in (config, reference)]
-    for seed in sorted({seed for _, seed in by_changes}):
-        own, other = (by_changes.get((names, seed), {}).get("scores") for names in changes)
+def gains_of(claim: Claim, scale: Simulated, cells: Mapping[tuple[str, int], Cell], score: str) -> list[float]:
+    """Return a row's gains over its reference in points, one per seed with both cells."""
+    names, gains = [changes_of(row.change(scale.base), scale.base) for row in (claim.row, claim.reference)], []
+    for seed in sorted({seed for _, seed in cells}):
+        own, other = (cells.get((name, seed), {}).get("scores") for name in names)
         if own and other:
             gains.append(100 * (own[score] - other[score]))
-    return gains, scale.train_frames * config.optimizer.epochs
+    return gains
 
 
 def figure_lines(results: Path) -> Iterator[str]:
@@ -188,63 +179,52 @@ def figure_lines(results: Path) -> Iterator[str]:
         yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} |"
 
 
-def claims(score: str) -> Iterator[tuple[str, Table, Row, float]]:
-    """Yield claim, table, row and the paper's gain for each row of the paper's tables with a gain in a score."""
+def claims() -> Iterator[Claim]:
+    """Yield the rows of the paper's tables with a gain in a score, then those with local geometry."""
     for table in TABLES.values():
         for row in table.rows:
-            label, paper = table.reference_of(row).label, table.paper_difference(row).get(score)
-            if row.label != label and paper is not None:
-                yield f"{table.name}: {row.label} instead of {label}", table, row, paper
+            reference, paper = table.reference_of(row), table.paper_difference(row)
+            if row is not reference and paper:
+                yield Claim(f"{table.name}: {row.label} instead of {reference.label}", row, reference, paper)
     for sizes, ablations in (("small", mrv_ablations.SMALL), ("compact", mrv_ablations.TABLE)):
         rows = {row.label: row for row in ablations.rows}
         for (label, reference), (name, *pair_of_paper) in LOCAL_GEOMETRY.items():
-            theirs, base = (PAPER["tables"][name]["rows"][key][score] for key in pair_of_paper)
-            row, full = rows[label], label if reference != "without priority" else "with priority"
-            claim = f"local geometry, {sizes}: {full} instead of {reference}"
-            pair = Table(ablations.name, ablations.title, (rows[reference], row), reference)
-            yield claim, pair, row, round(theirs - base, 2)
+            theirs, base = (PAPER["tables"][name]["rows"][key] for key in pair_of_paper)
+            full = label if reference != "without priority" else "with priority"
+            text = f"local geometry, {sizes}: {full} instead of {reference}"
+            yield Claim(text, rows[label], rows[reference], {s: round(theirs[s] - base[s], 2) for s in SCORES})
 
 
 def training_lines(results: Path) -> tuple[list[str], int]:
     """Return a line of Markdown for each claim about accuracy, and the number of claims without scores."""
     scale, lines, missing = quarter(Path("unused")), list[str](), 0
-    papers = {score: {claim: paper for claim, _, _, paper in claims(score)} for score in SCORES}
-    for claim, table, row, _ in claims("mAP"):
-        cells = [claim]
-        for score in SCORES:
-            gains, samples = gains_of(table, row, scale, results / "tables" / scale.name, score)
-            if gains:
-                paper = papers[score][claim]
-                mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
-                ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
-                cells += [f"{len(gains)}, {samples:,}"] if score == "mAP" else []
-                cells += [f"{paper:+.2f}", ours, ": ".join(filter(None, verdict(gains, paper)))]
-        if len(cells) > 1:
-            lines.append(f"| {' | '.join(cells)} |")
-        else:
+    cells = read_cells(results / "tables" / scale.name, scale)
+    for claim in claims():
+        gains = {score: gains_of(claim, scale, cells, score) for score in claim.paper}
+        if not gains["mAP"]:
             missing += 1
+            continue
+        samples = scale.train_frames * claim.row.change(scale.base).optimizer.epochs
+        columns = [claim.text, f"{len(gains['mAP'])}, {samples:,}"]
+        for score, own in gains.items():
+            mean, *bounds = interval(own) or (sum(own) / len(own),)
+            ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
+            paper = claim.paper[score]
+            columns += [f"{paper:+.2f}", ours, ": ".join(filter(None, verdict(own, paper)))]
+        lines.append(f"| {' | '.join(columns)} |")
     return lines, missing
 
 
-def _table(columns: tuple[str, ...], lines: Iterable[str]) -> str:
-    return "\n".join((f"| {' | '.join(columns)} |", f"{'|---' * len(columns)}|", *lines))
+def _table(columns: str, lines: Iterable[str]) -> str:
+    return "\n".join((f"| {columns} |", "|---" * (columns.count("|") + 1) + "|", *lines))
 
 
 def as_markdown(results: Path) -> str:
     """Format the whole ledger."""
     lines, missing = training_lines(results)
-    columns = (
-        "gain in points",
-        "seeds, samples",
-        "mAP, paper",
-        "here",
-        "verdict",
-        "NDS, paper",
-        "here",
-        "verdict",
-    )
+    columns = "gain in points | seeds, samples | mAP, paper | here | verdict | NDS, paper | here | verdict"
     parts = [
-        _table(("without training", "paper", "here", "from", "verdict"), figure_lines(results)),
+        _table("without training | paper | here | from | verdict", figure_lines(results)),
         _table(columns, lines),
         f"{missing} other claims have no scores of both rows for a seed.\n\n{_OUR_NDS}",
     ]
@@ -252,22 +232,10 @@ def as_markdown(results: Path) -> str:
 
 
 def with_ledger(document: str, ledger: str) -> str:
-    """Insert the ledger between its two marks in a document.
-
-    Raises:
-        ValueError: the marks are missing.
-
-    >>> print(with_ledger(_MARKS[0] + "old" + _MARKS[1], "new"), end="")
-    <!-- the ledger: python -m experiments.ledger --write -->
-    <BLANKLINE>
-    new
-    <!-- end of the ledger -->
-    """
-    first, last = map(re.escape, _MARKS)
-    if not re.search(f"{first}.*{last}", document, re.DOTALL):
-        raise ValueError(f"{README}: got no marks of the ledger, expected {_MARKS[0].strip()!r}")
-    inside = f"{_MARKS[0]}\n{ledger}\n{_MARKS[1]}"
-    return re.sub(f"{first}.*{last}", lambda _: inside, document, flags=re.DOTALL)
+    """Replace what is between the two marks of a document by the ledger."""
+    before, _, rest = document.partition(_MARKS[0])
+    after = rest.partition(_MARKS[1])[2]
+    return f"{before}{_MARKS[0]}\n{ledger}\n{_MARKS[1]}{after}"
 
 
 def main(args: Args) -> None:

@@ -1,25 +1,56 @@
-"""Real keyframes as frame sets, and scores by class and range."""
+"""Real keyframes, alone and as frame sets, and scores by class and range."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.keyframe import read_keyframe
 from experiments.script import real_data
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, SelectedFrames
+from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
+from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes
+from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, SelectedFrames, drop_close
+from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E as SENSOR
+from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
 SPANS_M = ((0, 20), (20, 40))
+
+
+def read_keyframe(folder: Path, sensor: Sensor, number: int = 0, reading: CloudReading = WHOLE_SWEEP) -> Frame:
+    """Read a folder's keyframe, or a list's keyframe by its number, with the boxes of the ten nuScenes classes.
+
+    ``boxes.json`` is ``{"lidar_file": NAME, "boxes": [{"class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy",
+    "num_lidar_pts"}]}`` in the LiDAR frame, or a list of such records. The count may also be called
+    "num_lidar_pts_at_key_frame". Unknown velocities are null and become NaN. Other classes are dropped.
+
+    Raises:
+        ValueError: with the file and the field.
+    """
+    file = folder / "boxes.json"
+    record = read_json(file, what="the boxes of a keyframe")
+    try:
+        record = record[number] if isinstance(record, list) else record
+        rows = [b for b in record["boxes"] if b["class"] in NUSCENES_CLASSES]
+        boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in LIMITS] for b in rows])
+        count = "num_lidar_pts" if all("num_lidar_pts" in b for b in rows) else "num_lidar_pts_at_key_frame"
+        counts = np.array([int(b[count]) for b in rows], np.int32)
+        cloud = folder / str(record["lidar_file"])
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{file}: a field is missing or of another kind: {error}") from None
+    boxes = boxes.reshape(-1, 9)
+    check_boxes(boxes, lambda i: f"{file}: box {i} of the ten classes")
+    labels = np.array([NUSCENES_CLASSES.index(b["class"]) for b in rows], np.int32)
+    points, num_close = drop_close(read_points(cloud, sensor), sensor, reading)
+    return Frame(points, boxes.astype(np.float32), labels, counts, num_close)
 
 
 def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]:
@@ -42,28 +73,26 @@ def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]
 
 
 def scores_by_range(
-    detections: Iterable[Detections],
-    frames: Iterable[Frame],
+    detections: Sequence[Detections],
+    frames: Sequence[Frame],
     *,
     repeats: int = 0,
     groups: Sequence[int] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Compute mAP and AP per class, of all boxes and of boxes with centres in a range of distances from the
-    sensor.
+    """Compute mAP and AP per class, of all boxes and of those whose centres are in a range of distances.
 
     Ground truth and detections are split alike, so a match across a border counts in neither range. With
     ``repeats`` bootstrap samples of frames, or of groups of frames, the mAP of more than two frames has an
     interval.
     """
-    detections, frames = list(detections), list(frames)
     parts = {"all": (detections, frames)}
     parts |= {f"{low}-{high} m": within(detections, frames, low, high) for low, high in SPANS_M}
     return {name: _scores(*part, repeats, groups) for name, part in parts.items()}
 
 
 def within(
-    detections: Iterable[Detections], frames: Iterable[Frame], low_m: float, high_m: float
-) -> tuple[list[Detections], list[Frame]]:
+    detections: Sequence[Detections], frames: Sequence[Frame], low_m: float, high_m: float
+) -> tuple[Sequence[Detections], Sequence[Frame]]:
     """Select detections and ground truth by the horizontal distance of their centres, excluding ``high_m``."""
 
     def inside(boxes: Any) -> np.ndarray:
@@ -78,7 +107,7 @@ def within(
 
 
 def _scores(
-    detections: list[Detections], frames: list[Frame], repeats: int, groups: Sequence[int] | None
+    detections: Sequence[Detections], frames: Sequence[Frame], repeats: int, groups: Sequence[int] | None
 ) -> dict[str, Any]:
     evaluation = evaluate_frames(detections, frames, metric_of(NUSCENES_CLASSES))
     pairs = zip(NUSCENES_CLASSES, evaluation.rankings, strict=True)

@@ -1,5 +1,6 @@
-"""Training runs of tables and studies."""
+"""Training runs of tables and studies, and training steps to be timed."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ from fcos_lidar_jax.evaluation.frames import frame_columns
 from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.inference.prediction import predict
-from fcos_lidar_jax.training import Schedule, train
+from fcos_lidar_jax.input_pipeline.batching import make_batch
+from fcos_lidar_jax.models import Variables, build_detector
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.training import Schedule, make_optimizer, make_state, make_train_step, train
 from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.types import Detections
 
@@ -42,3 +46,20 @@ def benchmark(detections: list[Detections], frames: list[Frame]) -> Evaluation:
     Ranges are relative to the sensor, and all attributes are wrong.
     """
     return evaluate(*frame_columns(detections, frames))
+
+
+def training_steps(
+    config: Config, sensor: Sensor, frames: Sequence[Frame], variables: Variables | None = None
+) -> Callable[[], dict[str, Any]]:
+    """Make a function that runs one training step on a batch of the frames, by default from random weights on."""
+    detector, optimizer = build_detector(config, sensor), make_optimizer(config.optimizer, 1000)
+    step = jax.jit(make_train_step(detector, optimizer), donate_argnums=0)
+    state = make_state(detector, optimizer, jax.random.key(0), variables=variables)
+    batch = jax.device_put(make_batch(frames, max_points=config.max_points, max_boxes=config.max_boxes))
+
+    def once() -> dict[str, Any]:
+        nonlocal state
+        state, metrics = step(state, batch)
+        return metrics
+
+    return once

@@ -37,9 +37,7 @@ def run_script(work: Callable[[T], object], options: type[T], description: str |
 
 
 def run_measurement(
-    measure: Callable[[OptionsT], dict[str, Any]],
-    options: type[OptionsT],
-    description: str | None,
+    measure: Callable[[OptionsT], dict[str, Any]], options: type[OptionsT], description: str | None
 ) -> NoReturn:
     """Like :func:`run_script`, for work whose record is printed and saved."""
     run_script(lambda args: save(measure(args), args.out), options, description)
@@ -83,11 +81,7 @@ def compact_json(value: Any, depth: int = 2) -> str:
 def find_real_data(folder: Path | None, *parts: str) -> Path | None:
     """Find a file or folder of the real data, below the given folder or the environment's FCOS_LIDAR_REAL_DATA.
 
-    Returns:
-        the path, or None if neither folder is given.
-
-    Raises:
-        ValueError: the path does not exist.
+    None if neither folder is given; a path that does not exist is refused.
     """
     root = folder or os.environ.get("FCOS_LIDAR_REAL_DATA")
     if not root:

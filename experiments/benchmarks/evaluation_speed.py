@@ -26,14 +26,27 @@ from typing import Any
 
 import numpy as np
 
-from experiments.benchmarks.made_tables import Row, annotations, class_of, write_tables
 from experiments.script import Options, run_script, save
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
 from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.evaluation.boxes import CLASS_ATTRIBUTES
 from fcos_lidar_jax.evaluation.results import LIDAR_META
+from fcos_lidar_jax.simulation.nuscenes_tables import (
+    MAP_FILE,
+    SWEEPS_PER_KEYFRAME,
+    Row,
+    fixed_tables,
+    object_rows,
+    scene_rows,
+)
+from fcos_lidar_jax.simulation.world import class_shares
 
 VERSION, SPLIT = "v1.0-trainval", "val"
 TRUTHS, PREDICTIONS = 30, 200  # of every keyframe
+CATEGORIES = {name: category for category, name in CATEGORY_TO_CLASS.items()}
+EGO = {"translation": [411.3039349319818, 1180.8903791765097, 0.0], "rotation": [0.9831, 0.0, 0.0, -0.18307]}
+MOUNT = {"translation": [0.9, 0.0, 1.8], "rotation": [1.0, 0.0, 0.0, 0.0]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,20 +58,48 @@ class Args(Options):
 
 
 def _make_files(root: Path, samples: int) -> None:
-    names = official_splits()[SPLIT]
-    keyframes = [len(part) for part in np.array_split(np.arange(samples), len(names))]
-    write_tables(root / VERSION, dict(zip(names, keyframes, strict=True)), objects=TRUTHS)
-    rng = np.random.default_rng(0)
+    """Write the tables and the results file; all objects of a scene are in all of its keyframes."""
+    scenes = official_splits()[SPLIT]
+    rng, tables = np.random.default_rng(0), defaultdict[str, list[Row]](list)
     with (root / "results.json").open("w") as stream:
         stream.write(f'{{"meta": {json.dumps(LIDAR_META)}, "results": {{')
-        for scene, number in enumerate(keyframes):
-            truths: defaultdict[str, list[tuple[str, Row]]] = defaultdict(list)
-            for o in range(TRUTHS):
-                for row in annotations(scene, o, number):
-                    truths[row["sample_token"]].append((class_of(scene, o), row))
-            found = {token: list(make_predictions(rng, rows)) for token, rows in truths.items()}
-            stream.write(("," if scene else "") + json.dumps(found)[1:-1])
+        for index, keyframes in enumerate(np.array_split(np.arange(samples), len(scenes))):
+            names = rng.choice(NUSCENES_CLASSES, TRUTHS, p=class_shares(1.0)).tolist()
+            rows = _scene(rng, index, names, len(keyframes))
+            rows["scene"][0]["name"] = scenes[index]
+            classes = {row["token"]: name for row, name in zip(rows["instance"], names, strict=True)}
+            truths = defaultdict[str, list[tuple[str, Row]]](list)
+            for row in rows["sample_annotation"]:
+                truths[row["sample_token"]].append((classes[row["instance_token"]], row))
+            found = {token: list(make_predictions(rng, own)) for token, own in truths.items()}
+            stream.write(("," if index else "") + json.dumps(found)[1:-1])
+            for table, own in rows.items():
+                tables[table] += own
         stream.write("}}")
+    logs = [row["token"] for row in tables["log"]]
+    (root / VERSION).mkdir()
+    for table, rows in (tables | fixed_tables(logs)).items():
+        with (root / VERSION / f"{table}.json").open("w") as stream:
+            json.dump(rows, stream, indent=0)
+    (root / MAP_FILE).parent.mkdir()
+    (root / MAP_FILE).touch()
+
+
+def _scene(rng: np.random.Generator, index: int, names: list[str], keyframes: int) -> dict[str, list[Row]]:
+    """Make the rows of a scene whose objects stand still or move in straight lines."""
+    shape = keyframes, len(names)
+    step = rng.choice([0, 2], (len(names), 1)) * rng.normal(0, [1, 1, 0], (len(names), 3))
+    start = EGO["translation"] + rng.normal(0, [22, 22, 0], (len(names), 3))
+    boxes = np.zeros((*shape, 7))
+    boxes[..., :3] = start + np.arange(keyframes)[:, None, None] * step
+    boxes[..., 3:6] = rng.uniform(0.5, 4.5, (len(names), 3))
+    boxes[..., 6] = rng.uniform(-np.pi, np.pi, len(names))
+    attributes = [next(iter(CLASS_ATTRIBUTES[name]), None) for name in names]
+    counts = rng.integers(0, 40, shape)
+    counts[[0, -1]] += 1  # annotations are from the first to the last point
+    objects = [CATEGORIES[name] for name in names], boxes, [attributes] * keyframes, np.ones(shape), counts
+    sweeps = (keyframes - 1) * SWEEPS_PER_KEYFRAME + 1
+    return scene_rows(0, index, MOUNT, [EGO] * sweeps) | object_rows(0, index, *objects)
 
 
 def make_predictions(rng: np.random.Generator, truths: list[tuple[str, Row]]) -> Iterator[Row]:

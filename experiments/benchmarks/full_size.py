@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 
-from experiments.benchmarks.training_steps import training_steps
 from experiments.hardware import peak_memory_gib
-from experiments.keyframe import read_keyframe
+from experiments.real_frames import read_keyframe
+from experiments.runs import training_steps
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.timing import interleaved
+from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import PRESETS
@@ -55,11 +55,8 @@ def training_memory(config: Config) -> dict[str, dict[str, float]]:
     and batch.
     """
     sensor, found = load_sensor(config.sensor), {}
-    points, boxes = (1, config.max_points), (1, config.max_boxes)
-    shapes = (*points, sensor.point_columns), points, (*boxes, 9), boxes, boxes
-    types = jnp.float32, jnp.bool_, jnp.float32, jnp.int32, jnp.bool_
-    arrays: list[Any] = list(map(jax.ShapeDtypeStruct, shapes, types))
-    batch = Batch(*arrays)
+    frame = make_frame(0, sensor, reading=cut_reading(1))
+    batch = make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes)
     for remat in (False, True):
         model = dataclasses.replace(config.model, remat=remat)
         detector = build_detector(dataclasses.replace(config, model=model), sensor)

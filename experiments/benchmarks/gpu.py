@@ -23,7 +23,6 @@ repeated, unless it failed; failed rows come last. No row starts that could take
 """
 
 import dataclasses
-import functools
 import json
 import multiprocessing
 import os
@@ -33,6 +32,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -40,12 +40,11 @@ import jax
 
 from experiments.benchmarks.latency import fused_cloud, padded, path_calls, simulated_sweeps, stage_calls
 from experiments.benchmarks.mrv_figures import mrv_times
-from experiments.benchmarks.train_speed import Function, compare
-from experiments.benchmarks.training_steps import training_steps
+from experiments.benchmarks.train_speed import Function, Size, compare
 from experiments.changes import SLIM, change
 from experiments.hardware import hardware, peak_memory_gib
 from experiments.pool import simulating
-from experiments.runs import trained
+from experiments.runs import trained, training_steps
 from experiments.script import compact_json, run_script, write_text
 from experiments.studies import ladder
 from fcos_lidar_jax.centerpoint import CenterPointConfig
@@ -84,7 +83,7 @@ class Args:
     torch_python: Path = Path(sys.executable)  # Interpreter that has torch.
 
     def repeats(self, number: int) -> int:
-        """Repeats, or steps, of a row."""
+        """Number of repeats, or steps, of a row."""
         return 2 if self.toy else number
 
 
@@ -154,14 +153,12 @@ def beside_torch(args: Args, *, precision: Precision, compiled: bool) -> dict[st
     device = "cuda" if jax.devices()[0].platform == "gpu" else "cpu"
     options: dict[str, Any] = {"python": args.torch_python, "precision": set_precision(precision)}
     options |= {"DEVICE": device, "AUTOCAST": int(precision == "bfloat16"), "COMPILE": int(compiled)}
+    size: Size = "slim" if args.toy else "full"
     cases: tuple[tuple[Function, int], ...] = (("forward", 1), ("train", 4))
-    record: dict[str, Any] = {"torch": found.stdout.strip()}
-    for function, batch in cases:
-        timed = compare(
-            "reduced" if args.toy else "full", args.repeats(20), function=function, batch=batch, **options
-        )
-        record[f"{function}, batch {batch}, seconds"] = timed
-    return record
+    return {"torch": found.stdout.strip()} | {
+        f"{f}, batch {n}, seconds": compare(size, args.repeats(20), function=f, batch=n, **options)
+        for f, n in cases
+    }
 
 
 def rounds(args: Args) -> dict[str, Any]:
@@ -177,7 +174,7 @@ def transfer(args: Args) -> dict[str, Any]:
     config, sensor = paper_preset(args)
     frame = frame_of(config, sensor)
     batch = make_batch([frame] * 32, max_points=config.max_points, max_boxes=config.max_boxes)
-    calls = {"transfer of 32": functools.partial(jax.device_put, batch)}
+    calls = {"transfer of 32": partial(jax.device_put, batch)}
     times = interleaved(calls | {"step of 4": training_steps(config, sensor, [frame] * 4)}, args.repeats(20))
     of_32, of_4 = (times[name]["median_ms"] for name in ("transfer of 32", "step of 4"))
     mib = sum(leaf.nbytes for leaf in jax.tree.leaves(batch)) >> 20
@@ -204,37 +201,31 @@ def scores(args: Args, *, trial: str) -> dict[str, Any]:
         return ladder.trial(trial, ladder.TRIALS[trial](ladder.BASE(SLIM(COMPACT))), 0, own)
 
 
-def _steps(*, remat: bool) -> dict[str, Row]:
-    return {
-        f"batch {b}, {p}" + ", remat" * remat: Row(
-            120, functools.partial(training, batch=b, precision=p, remat=remat)
-        )
-        for b in (4, 8)
-        for p in _PRECISIONS[1:]
-    }
-
-
 _PRECISIONS: tuple[Precision, ...] = ("float32", "tf32", "bfloat16")
 _LOOK = change(refinement=RefinementConfig())(QUICKSTART)
 PARTS: dict[str, dict[str, Row]] = {
-    "detection": {p: Row(120, functools.partial(detection, precision=p)) for p in _PRECISIONS},
+    "detection": {p: Row(120, partial(detection, precision=p)) for p in _PRECISIONS},
     "training": {
-        **_steps(remat=False),
         "batch 4, tf32, from files": Row(120, training_from_files),
-        **_steps(remat=True),
+        **{
+            f"batch {b}, {p}" + ", remat" * remat: Row(120, partial(training, batch=b, precision=p, remat=remat))
+            for remat in (False, True)
+            for b in (4, 8)
+            for p in _PRECISIONS[1:]
+        },
     },
     "torch": {
-        p + ", compiled" * compiled: Row(180, functools.partial(beside_torch, precision=p, compiled=compiled))
+        p + ", compiled" * compiled: Row(180, partial(beside_torch, precision=p, compiled=compiled))
         for compiled in (False, True)
         for p in _PRECISIONS[1:]
     },
     "projection": {
         "rounds": Row(120, rounds),
         "transfer": Row(120, transfer),
-        "CenterPoint": Row(120, functools.partial(stages, config=CENTERPOINT_PILLARS, toy=_TOY_PEER)),
-        "second look": Row(120, functools.partial(stages, config=COMPACT, toy=_LOOK)),
+        "CenterPoint": Row(120, partial(stages, config=CENTERPOINT_PILLARS, toy=_TOY_PEER)),
+        "second look": Row(120, partial(stages, config=COMPACT, toy=_LOOK)),
     },
-    "scores": {name: Row(300, functools.partial(scores, trial=name)) for name in ("larger", "larger, joint")},
+    "scores": {name: Row(300, partial(scores, trial=name)) for name in ("larger", "larger, joint")},
 }
 """Part -> rows, in the order of their worth."""
 

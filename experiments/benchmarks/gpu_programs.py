@@ -23,7 +23,6 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -136,8 +135,8 @@ class Args(Options):
     one: str | None = None  # Compile one program in this process and print its record (internal).
 
 
-def measure(args: Args) -> dict[str, Any]:
-    """Compile the programs one by one and print a line for each."""
+def check(args: Args) -> None:
+    """Compile the programs one by one, print a line for each, save the record, and fail if one fails the check."""
     known = all_programs() if args.all or args.programs else PROGRAMS
     if unknown := [name for name in args.programs if name not in known]:
         raise ValueError(f"--programs: got {unknown[0]!r}, expected some of {', '.join(known)}")
@@ -157,15 +156,9 @@ def measure(args: Args) -> dict[str, Any]:
     for name in args.programs or known:
         records[name] = _compiled(name, args, environment)
         print(_line(name, records[name]), flush=True)
-    return {"programs": records, "run": False}
-
-
-def check(args: Args) -> None:
-    """Compile all programs, save the record, and fail if a program fails the check."""
-    record = measure(args)
-    programs = record["programs"]
-    failed = [name for name, found in programs.items() if found.get("failed") or found.get("exchanges")]
-    save(record, args.out, f"{len(programs) - len(failed)} of {len(programs)} programs compile as they should")
+    failed = [name for name, found in records.items() if found.get("failed") or found.get("exchanges")]
+    said = f"{len(records) - len(failed)} of {len(records)} programs compile as they should"
+    save({"programs": records, "run": False}, args.out, said)
     if failed:
         raise ValueError(f"not as they should be: {', '.join(failed)}")
 
@@ -173,15 +166,9 @@ def check(args: Args) -> None:
 def _compiled(name: str, args: Args, environment: dict[str, str]) -> dict[str, Any]:
     """Compile one program in a separate process."""
     command = [sys.executable, "-m", "experiments.benchmarks.gpu_programs", "--plugin", str(args.plugin)]
+    options: dict[str, Any] = {"capture_output": True, "text": True, "timeout": args.limit_s}
     try:
-        done = subprocess.run(
-            [*command, "--one", name],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=args.limit_s,
-            env=environment,
-        )
+        done = subprocess.run([*command, "--one", name], check=False, env=environment, **options)
     except subprocess.TimeoutExpired:
         return {"failed": f"not compiled after {args.limit_s} s"}
     if done.returncode == 0:
@@ -205,7 +192,7 @@ def _line(name: str, record: dict[str, Any]) -> str:
 
 
 def compile_program(program: Program) -> dict[str, Any]:
-    """Compile in this process, in the environment set by :func:`measure`."""
+    """Compile in this process, in the environment set by :func:`check`."""
     jax.devices()  # Finds the plugin too.
     topology = topologies.get_topology_desc(
         platform="cuda",
@@ -222,14 +209,11 @@ def compile_program(program: Program) -> dict[str, Any]:
     lowered = jitted.lower(*given)
     compiled = lowered.compile()
     seconds = time.monotonic() - began
-    hlo: Any = lowered.compiler_ir("hlo")
-    flops = _jax.hlo_module_cost_analysis(jax.devices()[0].client, hlo.get_hlo_module())[
-        "flops"
-    ]  # before optimisation
+    hlo: Any = lowered.compiler_ir("hlo")  # before optimisation
+    flops = _jax.hlo_module_cost_analysis(jax.devices()[0].client, hlo.get_hlo_module())["flops"]
     module = str(compiled.as_text())
     memory: Any = compiled.memory_analysis()
     kernels, loops = count_kernels(module)
-    found = re.findall(r" (all-reduce|" + "|".join(_EXCHANGES) + r")(?:-start)?\(", module)
     record = {
         **dataclasses.asdict(program),
         "seconds": round(seconds),
@@ -241,9 +225,9 @@ def compile_program(program: Program) -> dict[str, Any]:
         "custom_calls": dict(collections.Counter(re.findall(r'custom_call_target="([^"]+)"', module))),
     }
     if program.devices > 1:
-        counts = collections.Counter(found)
-        record["all_reduces"] = counts.pop("all-reduce", 0)
-        record["exchanges"] = dict(counts)
+        found = re.findall(r" (all-reduce|" + "|".join(_EXCHANGES) + r")(?:-start)?\(", module)
+        record["exchanges"] = dict(collections.Counter(found))
+        record["all_reduces"] = record["exchanges"].pop("all-reduce", 0)
     return record
 
 
@@ -284,27 +268,22 @@ def count_kernels(module: str) -> tuple[int, list[tuple[int | None, int]]]:
     """Count the kernels of a compiled program outside loops, and list (iterations, kernels each) of all loops.
 
     Iterations are None if they depend on data. Nested loops are separate entries.
-
-    >>> text = '''%body (p: s32[]) -> s32[] {
-    ...   %a = s32[] fusion(%p), kind=kLoop
-    ... }
-    ... ENTRY %main (p: s32[]) -> s32[] {
-    ...   %w = s32[] while(%p), condition=%c, body=%body, backend_config={"known_trip_count":{"n":"5"}}
-    ...   ROOT %b = s32[] fusion(%w), kind=kLoop
-    ... }'''
-    >>> count_kernels(text)
-    (1, [(5, 1)])
     """
-    bodies: dict[str, list[tuple[str, str]]] = {}
-    entry = ""
-    for name, operations in _computations(module):
-        bodies[name.removeprefix("ENTRY ")] = operations
-        entry = name.removeprefix("ENTRY ") if name.startswith("ENTRY ") else entry
+    bodies: dict[str, list[tuple[str, str]]] = {}  # Operations of each computation, and their lines.
+    name = entry = ""
+    for line in module.splitlines():
+        if head := re.match(r"(ENTRY )?(%[\w.\-]+) \(.*\{$", line):
+            name, entry = head[2], head[2] if head[1] else entry
+            bodies[name] = []
+        elif line.startswith("}"):
+            name = ""
+        elif name and (found := re.search(r"= .*? ([a-z][a-z\-]*)\(", line)):
+            bodies[name].append((found[1], line))
     loops: list[tuple[int | None, int]] = []
 
     def kernels(name: str) -> int:
         count = 0
-        for operation, line in bodies.get(name, []):
+        for operation, line in bodies.get(name, ()):
             if operation == "while":
                 body, trips = re.search(r"body=(%[\w.\-]+)", line), re.search(r'trip_count":\{"n":"(\d+)"', line)
                 assert body is not None
@@ -323,20 +302,6 @@ def count_kernels(module: str) -> tuple[int, list[tuple[int | None, int]]]:
         return count
 
     return kernels(entry), loops
-
-
-def _computations(module: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-    """Yield name and (operation, line) pairs of each computation in a module's text."""
-    name, operations = None, []
-    for line in module.splitlines():
-        head = re.match(r"(ENTRY )?(%[\w.\-]+) \(.*\{$", line)
-        if head:
-            name, operations = (head[1] or "") + head[2], []
-        elif line.startswith("}") and name is not None:
-            yield name, operations
-            name = None
-        elif name is not None and (found := re.search(r"= .*? ([a-z][a-z\-]*)\(", line)):
-            operations.append((found[1], line))
 
 
 if __name__ == "__main__":

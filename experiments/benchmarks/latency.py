@@ -19,7 +19,7 @@ import functools
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -34,7 +34,6 @@ from fcos_lidar_jax.inference import make_detect, make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import Detector, Variables, build_detector
-from fcos_lidar_jax.models.convolution import Image
 from fcos_lidar_jax.models.detector import Network, network_input
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, PRESETS
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, load_sensor
@@ -97,31 +96,6 @@ def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
     return make_cloud(points, config, sensor=sensor)
 
 
-class Parts(NamedTuple):
-    """Compiled parts of FCOS-LiDAR's network. All but the first take all variables and the previous output."""
-
-    preprocess: Callable[[Any], Image]
-    stem: Callable[[Variables, Any], Any]
-    backbone: Callable[[Variables, Any], Any]
-    fpn: Callable[[Variables, Any], Any]
-    heads: Callable[[Variables, Any], Any]
-
-
-def network_parts(config: Config, sensor: Sensor) -> Parts:
-    """Split the network of a configuration without ``local_geometry`` into parts, to time each of them."""
-    layout, network = image_layout(sensor, config.model), Network(config.model, len(config.classes))
-
-    def part(name: str, **options: Any) -> Callable[[Variables, Any], Any]:
-        def apply(variables: Variables, x: Any) -> Any:
-            return network.apply(variables, x, method=lambda whole, x: getattr(whole, name)(x, **options))
-
-        return jax.jit(apply)
-
-    preprocess = jax.jit(lambda features: network_input(features, config.model, layout))
-    front = part("stem", train=False), part("backbone", train=False)
-    return Parts(preprocess, *front, part("fpn"), part("heads"))
-
-
 def stage_calls(detector: Detector, variables: Variables, cloud: Cloud) -> dict[str, Call]:
     """Make calls of a detector's stages for one cloud, with precomputed inputs."""
     stages, detect = make_stages(detector), jax.jit(make_detect(detector))
@@ -144,19 +118,32 @@ def stage_calls(detector: Detector, variables: Variables, cloud: Cloud) -> dict[
 
 
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:
-    """Make calls of FCOS-LiDAR's stages, and of the parts of its network, for one cloud."""
-    parts, calls = network_parts(config, sensor), stage_calls(build_detector(config, sensor), variables, cloud)
+    """Make calls of FCOS-LiDAR's stages, and of the parts of its network, for one cloud.
+
+    The configuration has no ``local_geometry``, which the parts would need as another input.
+    """
+    layout, network = image_layout(sensor, config.model), Network(config.model, len(config.classes))
+
+    def part(apply: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+        """Compile methods of the network in sequence."""
+        compiled = jax.jit(lambda variables, x: network.apply(variables, x, method=apply))
+        return lambda x: compiled(variables, x)
+
+    def backbone(whole: Any, features: Any) -> Any:
+        return whole.backbone(whole.stem(network_input(features, config.model, layout), train=False), train=False)
+
+    body, front = part(backbone), part(lambda whole, levels: whole.heads(whole.fpn(levels)))
+    fpn, heads = part(lambda whole, levels: whole.fpn(levels)), part(lambda whole, pyramid: whole.heads(pyramid))
+    calls = stage_calls(build_detector(config, sensor), variables, cloud)
     calls["MRV"] = calls.pop("preparation")
-    body = jax.jit(lambda v, f: parts.backbone(v, parts.stem(v, parts.preprocess(f))))
-    front = jax.jit(lambda v, levels: parts.heads(v, parts.fpn(v, levels)))
     features = calls["MRV"]().features[None]
-    levels = body(variables, features)
-    pyramid = parts.fpn(variables, levels)
+    levels = body(features)
+    pyramid = fpn(levels)
     return calls | {
-        "Backbone (stem and backbone)": lambda: body(variables, features),
-        "Heads (pyramid and heads)": lambda: front(variables, levels),
-        "pyramid alone": lambda: parts.fpn(variables, levels),
-        "heads alone": lambda: parts.heads(variables, pyramid),
+        "Backbone (stem and backbone)": lambda: body(features),
+        "Heads (pyramid and heads)": lambda: front(levels),
+        "pyramid alone": lambda: fpn(levels),
+        "heads alone": lambda: heads(pyramid),
     }
 
 
@@ -164,7 +151,7 @@ def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: s
     """Load a padded cloud from files."""
     number = 1 if setting == "single" else 10
     points, num_close = drive.fuse_sweeps(token, CloudReading(number, "all", config.projection.close_m))
-    config = dataclasses.replace(config, max_points=ROWS[setting])
+    config = dataclasses.replace(config, max_points=ROWS[setting], num_sweeps=number)
     return make_cloud(points, config, sensor=sensor, num_close=num_close).points
 
 

@@ -40,7 +40,6 @@ class Args(Options):
 
 
 Close = Literal["all", "none"]
-_CLOSE: dict[str, Close] = {"with": "none", "without": "all"}
 
 
 def kept_by_rounds(
@@ -48,19 +47,12 @@ def kept_by_rounds(
 ) -> dict[str, Any]:
     """Count the kept points of a fused cloud f32[n, c] by rounds, with and without priority of the current sweep.
 
-    A point is current if its time lag is 0; ``close`` is ``"none"`` to keep the points on the vehicle, or
-    ``"all"``.
+    A point is current if its time lag is 0; ``close`` tells which points on the vehicle are removed.
 
     Returns:
         ``in_range`` and ``in_view``, points within the sensor's limits and, of those, in its field of view; for
         ``prioritized`` and ``not prioritized``, by rounds: ``kept``, ``percent`` of those in range, ``current`` of
         the kept.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
-    >>> found = kept_by_rounds(cloud, TINY, rounds=(1, 2))
-    >>> found["prioritized"]["kept"], found["prioritized"]["current"], found["not prioritized"]["current"]
-    ({'1': 1, '2': 2}, {'1': 1, '2': 1}, {'1': 0, '2': 1})
     """
     valid = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, CloudReading(remove_close=close)))
     (low, high), z = sensor.limit_z_m, points[:, 2]
@@ -82,13 +74,7 @@ def kept_by_rounds(
 
 
 def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[str, dict[str, float]]]:
-    """Average :func:`kept_by_rounds` over clouds.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
-    >>> mean_kept([cloud, cloud * np.float32([[1], [99]])], TINY)["prioritized"]["percent"]["1"]
-    75.0
-    """
+    """Average :func:`kept_by_rounds` over clouds."""
     found = [kept_by_rounds(cloud, sensor) for cloud in clouds]
     return {
         name: {
@@ -125,13 +111,14 @@ def measure(args: Args) -> dict[str, Any]:
     rows, sensor = PAPER["tables"]["table1"]["rows"], NUSCENES_HDL32E
     paper = {str(r): rows[f"multi, {r}"]["time_ms"] for r in ROUNDS}
     cloud, label = fused_cloud(args.data, sensor)
+    close: dict[str, Close] = {"with": "none", "without": "all"}
     return {
         "cloud": label,
         "points": len(cloud),
         "kept": {
-            f"{sweeps}, {which} close points": kept_by_rounds(points, sensor, close=close)
+            f"{sweeps}, {which} close points": kept_by_rounds(points, sensor, close=removed)
             for sweeps, points in (("ten sweeps", cloud), ("one sweep", cloud[cloud[:, 4] == 0]))
-            for which, close in _CLOSE.items()
+            for which, removed in close.items()
         },
         "repeats": args.repeats,
         "times": mrv_times(cloud, sensor, repeats=args.repeats),

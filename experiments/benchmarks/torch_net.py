@@ -1,11 +1,11 @@
 """The same network for timings, written like PyTorch's users would write it.
 
 Modality-wise stem by ``groups=9``, LiDAR-Net, feature pyramid, heads with group norm, 1x1 merges per branch.
-Sizes come from the environment: ``BATCH``, ``HEIGHT`` and ``WIDTH`` of the image, its ``ROUNDS``, and the
-channels of each ``TYPE``, of ``STEM``, ``PYRAMID``, ``HEAD`` and the backbone's stages (``WIDTHS``). ``DEVICE`` is
-``cpu`` or ``cuda``. Options are 0 or 1: ``CHANNELS_LAST`` (default 1), ``AUTOCAST`` to bfloat16, ``COMPILE`` by
-``torch.compile``. ``FNS["forward"]`` is a forward pass as in detection, ``FNS["train"]`` a forward and a backward
-pass; there is no assignment, no optimizer and no projection in it. Needs torch, which the project itself does not.
+Sizes come from the environment: ``BATCH`` and ``HEIGHT`` of the images, their ``ROUNDS``, and the channels of each
+``TYPE``, of ``STEM``, ``PYRAMID``, ``HEAD`` and the backbone's stages (``WIDTHS``). ``DEVICE`` is ``cpu`` or
+``cuda``. ``AUTOCAST`` to bfloat16 and ``COMPILE`` by ``torch.compile`` are 0 or 1. ``FNS["forward"]`` is a forward
+pass as in detection, ``FNS["train"]`` a forward and a backward pass; there is no assignment, no optimizer and no
+projection in it. Needs torch, which the project itself does not.
 """
 
 import os
@@ -14,17 +14,12 @@ import torch  # type: ignore[import-not-found]
 import torch.nn.functional as F  # type: ignore[import-not-found]
 from torch import nn  # type: ignore[import-not-found]
 
-_SIZES = {"HEIGHT": 64, "WIDTH": 1088, "ROUNDS": 5, "BATCH": 1}
-_CHANNELS = {"TYPE": 32, "STEM": 64, "PYRAMID": 256, "HEAD": 64}
-HEIGHT, WIDTH, ROUNDS, BATCH = (int(os.environ.get(name, value)) for name, value in _SIZES.items())
-TYPE, STEM, PYRAMID, HEAD = (int(os.environ.get(name, value)) for name, value in _CHANNELS.items())
-WIDTHS = tuple(map(int, os.environ.get("WIDTHS", "64,128,128,128").split(",")))
-BLOCKS, STRIDES = (4, 4, 1, 1), (1, 2, 2, 2)
+HEIGHT, ROUNDS, BATCH = (int(os.environ[name]) for name in ("HEIGHT", "ROUNDS", "BATCH"))
+TYPE, STEM, PYRAMID, HEAD = (int(os.environ[name]) for name in ("TYPE", "STEM", "PYRAMID", "HEAD"))
+WIDTHS = tuple(map(int, os.environ["WIDTHS"].split(",")))
+WIDTH, BLOCKS, STRIDES = 1088, (4, 4, 1, 1), (1, 2, 2, 2)
 DEVICE = os.environ.get("DEVICE", "cpu")
-CHANNELS_LAST, AUTOCAST, COMPILE = (
-    os.environ.get(name, default) == "1"
-    for name, default in (("CHANNELS_LAST", "1"), ("AUTOCAST", "0"), ("COMPILE", "0"))
-)
+AUTOCAST, COMPILE = (os.environ.get(name) == "1" for name in ("AUTOCAST", "COMPILE"))
 
 
 def conv(inputs: int, outputs: int, size: int, **options: int) -> nn.Conv2d:
@@ -49,7 +44,6 @@ class Bottleneck(nn.Module):
         self.shortcut = shortcut if project else nn.Identity()
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Apply it."""
         return F.relu(self.body(x) + self.shortcut(x))
 
 
@@ -105,10 +99,10 @@ class Network(nn.Module):
 
 
 torch.backends.cudnn.benchmark = torch.backends.cudnn.allow_tf32 = True  # As XLA does by default.
-layout = torch.channels_last if CHANNELS_LAST else torch.contiguous_format
-network = Network().to(DEVICE, memory_format=layout)
+network = Network().to(DEVICE, memory_format=torch.channels_last)
 run = torch.compile(network) if COMPILE else network
-images = torch.randn(BATCH, 9 * ROUNDS, HEIGHT, WIDTH, device=DEVICE).contiguous(memory_format=layout)
+images = torch.randn(BATCH, 9 * ROUNDS, HEIGHT, WIDTH, device=DEVICE)
+images = images.contiguous(memory_format=torch.channels_last)
 
 
 def _outputs() -> list[torch.Tensor]:

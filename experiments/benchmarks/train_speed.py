@@ -1,14 +1,11 @@
 """Time of a training step compared with PyTorch's forward and backward pass on the same CPU.
 
     python -m experiments.benchmarks.train_speed --torch-python PYTHON  # an interpreter that has torch
-    python -m experiments.benchmarks.train_speed --torch-python PYTHON --peer FILE
 
 Ours is the whole step: augmentation, projection, network, assignment, losses, gradients, AdamW. The peer's is
-only the network with a plain loss (``torch_net.py``, or any file with ``FNS["train"]``). Both run in
-turns with batch size 1 in float32: ``reduced`` (32x288, five rounds, a quarter of the channels), ``slim``
-(32x1088, one round, 0.9 M parameters), ``full`` (64x1088, five rounds, the paper's channels) and ``full_64``,
-whose pyramid has 64 channels. Cost: about half an hour on two CPU cores and 12 GB. Expected: at most 1.4 of the
-peer's time when slim, 1.25 at full size, 2 when reduced.
+only the network with a plain loss (``torch_net.py``). Both run in turns with batch size 1 in float32: ``slim``
+(32x1088, one round, 0.9 M parameters) and ``full`` (64x1088, five rounds, the paper's channels). Cost: a quarter
+of an hour on two CPU cores and 12 GB. Expected: at most 1.4 of the peer's time when slim, 1.25 at full size.
 """
 
 import dataclasses
@@ -23,8 +20,8 @@ from typing import Any, Literal
 
 import jax
 
-from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
+from experiments.runs import training_steps
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import Frame
@@ -36,7 +33,7 @@ from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 
-Size = Literal["reduced", "slim", "full_64", "full"]
+Size = Literal["slim", "full"]
 Function = Literal["forward", "train"]
 PEER = Path(__file__).with_name("torch_net.py")
 _PEER_LOOP = """
@@ -59,25 +56,18 @@ class Args(Options):
     """Options of the comparison."""
 
     torch_python: Path  # Interpreter that has torch.
-    peer: Path = PEER  # Program with FNS["train"].
-    sizes: tuple[Size, ...] = ("reduced", "slim", "full_64", "full")  # Which to compare.
-    repeats: int = 15  # Turns; ten times as many when reduced.
+    sizes: tuple[Size, ...] = ("slim", "full")  # Which to compare.
+    repeats: int = 15  # Turns.
 
 
-_FULL = {"HEIGHT": 64, "WIDTH": 1088, "ROUNDS": 5, "TYPE": 32, "STEM": 64, "WIDTHS": "64,128,128,128", "HEAD": 64}
-_SLIM = {"HEIGHT": 32, "WIDTH": 1088, "ROUNDS": 1, "TYPE": 4, "STEM": 16, "WIDTHS": "16,32,32,32", "HEAD": 32}
-_REDUCED = {"HEIGHT": 32, "WIDTH": 288, "ROUNDS": 5, "TYPE": 8, "STEM": 16, "WIDTHS": "16,32,32,32", "HEAD": 16}
-_SIZES: dict[Size, dict[str, Any]] = {
-    "reduced": {**_REDUCED, "PYRAMID": 16},
-    "slim": {**_SLIM, "PYRAMID": 32},
-    "full_64": {**_FULL, "PYRAMID": 64},
-    "full": {**_FULL, "PYRAMID": 256},
-}
+_FULL = {"HEIGHT": 64, "ROUNDS": 5, "TYPE": 32, "STEM": 64, "WIDTHS": "64,128,128,128", "HEAD": 64, "PYRAMID": 256}
+_SLIM = {"HEIGHT": 32, "ROUNDS": 1, "TYPE": 4, "STEM": 16, "WIDTHS": "16,32,32,32", "HEAD": 32, "PYRAMID": 32}
+_SIZES: dict[Size, dict[str, Any]] = {"slim": _SLIM, "full": _FULL}
 
 
-def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
+def of_size(size: dict[str, Any]) -> Config:
     """Configure the paper's detector for one sweep with given sizes."""
-    config = change(
+    return change(
         num_sweeps=1,
         max_points=40_000,
         projection__num_rounds=size["ROUNDS"],
@@ -88,17 +78,10 @@ def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
         model__fpn_channels=size["PYRAMID"],
         model__head_channels=size["HEAD"],
     )(NUSCENES)
-    return config, dataclasses.replace(NUSCENES_HDL32E, num_columns=min(size["WIDTH"], 1086))
 
 
 def turn_by_turn(
-    ours: Call,
-    repeats: int,
-    *,
-    peer: Path,
-    environment: Mapping[str, object],
-    python: Path,
-    function: Function = "train",
+    ours: Call, repeats: int, *, environment: Mapping[str, object], python: Path, function: Function
 ) -> dict[str, float]:
     """Time our call and a peer's function in turns, because the speed of a machine drifts.
 
@@ -111,12 +94,12 @@ def turn_by_turn(
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     times: dict[str, list[float]] = {"ours": [], "peer": []}
     with subprocess.Popen(
-        [python, "-c", _PEER_LOOP, peer.absolute(), function], env=variables, bufsize=1, **pipes
+        [python, "-c", _PEER_LOOP, PEER, function], env=variables, bufsize=1, **pipes
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         if process.stdout.readline() != "ready\n":
-            raise ValueError(f'--peer: {peer}: got no FNS["{function}"] that runs')
+            raise ValueError(f"--torch-python: {python}: {PEER.name} does not run there")
         jax.block_until_ready(ours())
         for _ in range(repeats):
             began = time.perf_counter()
@@ -143,31 +126,25 @@ def compare(
     repeats: int,
     *,
     python: Path,
-    peer: Path = PEER,
     function: Function = "train",
     batch: int = 1,
     precision: Literal["float32", "bfloat16"] = "float32",
     **options: object,
 ) -> dict[str, float]:
     """Compare our training step, or our forward pass, with a peer's; options are of its environment."""
-    size = _SIZES[name]
-    config, sensor = of_size(size)
-    config = change(model__precision=precision)(config)
+    size, sensor = _SIZES[name], NUSCENES_HDL32E
+    config = change(model__precision=precision)(of_size(size))
     frames = [make_frame(0, sensor, num_objects=30, reading=cut_reading(1))] * batch
-    over = 64 // size["STEM"]
-    others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
-    # Other peers use other names.
-    environment = {**size, **others, "TRAIN": 1, "CL": 1, "BATCH": batch, **options}
     ours = (training_steps if function == "train" else forward_pass)(config, sensor, frames)
-    return turn_by_turn(ours, repeats, peer=peer, environment=environment, python=python, function=function)
+    environment = {**size, "BATCH": batch, **options}
+    return turn_by_turn(ours, repeats, environment=environment, python=python, function=function)
 
 
 def measure(args: Args) -> dict[str, Any]:
     """Compare at the selected sizes."""
-    record: dict[str, Any] = {"peer": args.peer.name}
+    record: dict[str, Any] = {"peer": PEER.name}
     for name in args.sizes:
-        repeats = args.repeats * (10 if name == "reduced" else 1)
-        record[name] = compare(name, repeats, python=args.torch_python, peer=args.peer)
+        record[name] = compare(name, args.repeats, python=args.torch_python)
         print(f"{name}: {json.dumps(record[name])}", flush=True)
     return record
 

@@ -55,11 +55,7 @@ def run_name(changes: str, seed: int) -> str:
 
 
 def read_cells(folder: Path, scale: Scale) -> dict[tuple[str, int], Cell]:
-    """Read the finished cells of a scale, by changes and seed.
-
-    Raises:
-        ValueError: data or base differ; the message names the first field.
-    """
+    """Read the finished cells of a scale, by changes and seed; cells of other data or another base are refused."""
     if not (folder / _CELLS).is_file():
         return {}
     _check(folder / _SCALE, _shared(scale))
@@ -74,9 +70,8 @@ def add_cell(folder: Path, scale: Scale, cell: Cell, *, locks: Path) -> Cell:
         cells = read_cells(folder, scale) | {(cell["changes"], cell["seed"]): cell}
         rows = [_row(cells[key]) for key in sorted(cells)]
         text = io.StringIO()
-        writer = csv.DictWriter(
-            text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n"
-        )
+        columns = list(dict.fromkeys(name for row in rows for name in row))
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
         if not (folder / _SCALE).is_file():
@@ -104,8 +99,7 @@ def _flat(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check(file: Path, shared: dict[str, Any]) -> None:
-    """Compare data and base of the cells with the scale's; fields that the file lacks have their later
-    defaults."""
+    """Compare data and base of the cells with the scale's; fields that the file lacks have later defaults."""
     recorded = _flat({"base": LATER_FIELDS}) | _flat(read_json(file, dict[str, Any]))
     for field, value in _flat(shared).items():
         if field != "base.name" and recorded.get(field, value) != value:

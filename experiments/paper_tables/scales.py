@@ -29,7 +29,6 @@ from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.data.frame import Frame, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.metrics import evaluate
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
@@ -114,16 +113,8 @@ class Simulated:
         """Training or test frames, with the same streets and sweeps for each number of sweeps."""
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, UNSEEN_SEED)}[split]
         sweeps = self.base.num_sweeps
-        made = SimulatedFrames(
-            self.sensor,
-            number,
-            first,
-            self.num_objects,
-            self.reach_m,
-            self.min_points,
-            CloudReading(sweeps, "all", _BONNET_M),
-            streets=self.streets,
-        )
+        reading, extent = CloudReading(sweeps, "all", _BONNET_M), (self.num_objects, self.reach_m, self.min_points)
+        made = SimulatedFrames(self.sensor, number, first, *extent, reading, streets=self.streets)
         return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
 
     @contextlib.contextmanager
@@ -153,10 +144,8 @@ class Simulated:
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """Train in a folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}, "errors"}``.
 
-        ``errors`` are nuScenes' errors of true positives: means over the classes, and of cars.
-
-        With ``evaluations`` also ``curve``, [[samples, mAP]], ``ranges``, scores by distance, and
-        ``seconds_of_steps``.
+        ``errors`` are nuScenes' errors of true positives: means over the classes, and of cars. With
+        ``evaluations`` also ``curve``, [[samples, mAP]], ``ranges``, scores by distance, and ``seconds_of_steps``.
         """
         frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
@@ -212,20 +201,11 @@ class NuScenesLayout:
         return "nuscenes"
 
     def checked(self) -> "NuScenesLayout":
-        """Fill in the defaults.
-
-        Raises:
-            ValueError: data, index or splits are missing, in --test-version too.
-        """
-        if self.data_root is None:
-            raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")
+        """Fill in the defaults, and refuse missing data, indices and splits, of --test-version too."""
         data = find_data_set(self.data_root, "nuscenes", self.version)
-        index = self.index or data.index
-        if (self.data_root / data.version).is_dir() and not has_index(index):
-            raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
         split = functools.partial(default_split, data, required=True, splits=self.splits)
         splits = {"train_split": self.train_split or split("train"), "val_split": self.val_split or split("val")}
-        whole = dataclasses.replace(self, version=data.version, index=index, **splits)
+        whole = dataclasses.replace(self, version=data.version, index=self.index or data.index, **splits)
         whole.describe()
         if self.test_version is not None:  # before days of training
             try:
@@ -272,21 +252,12 @@ class NuScenesLayout:
         }
 
     def objects(self, frames: NuScenesFrames) -> GroundTruthDatabase:
-        """Open the database that fcos-lidar prepare has cut from the training frames.
-
-        Raises:
-            ValueError: there is no such database.
-        """
+        """Open the database that fcos-lidar prepare has cut from the training frames."""
         assert self.index is not None
         folder = database.objects_folder(self.index, str(self.train_split))
-        if not folder.is_dir():
-            raise ValueError(f"{folder}: no objects here, expected some: run fcos-lidar prepare")
-        objects = database.open_database(folder)
-        reading = database.cut_reading(objects.manifest.num_sweeps)
-        if objects.manifest.source != dataclasses.replace(frames, reading=reading).fingerprint():
-            origin = f"cut from other frames than {self.train_split}"
-            raise ValueError(f"{folder}: {origin}: run fcos-lidar prepare again")
-        return objects
+        reading = database.cut_reading(database.open_database(folder).manifest.num_sweeps)
+        source = dataclasses.replace(frames, reading=reading).fingerprint()
+        return database.open_database(folder, fingerprint=source)
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """Train and evaluate like the benchmark; the results file stays in the folder."""

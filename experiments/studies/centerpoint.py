@@ -24,9 +24,9 @@ import jax
 import numpy as np
 
 from experiments.benchmarks.latency import stage_calls
-from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
+from experiments.runs import training_steps
 from experiments.script import run_script
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.config import Config

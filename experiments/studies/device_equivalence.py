@@ -59,7 +59,7 @@ CONFIG = change(
 class Args(Options):
     """Options of the comparison."""
 
-    quick: bool = False  # Only five steps in float64, on one device and on eight devices in two processes.
+    quick: bool = False  # Only five steps in float64, on one device and on two.
 
 
 def batch_of(step: int) -> Batch:
@@ -119,8 +119,10 @@ def measure(out: Path, mesh: Mesh, dtype: str, *, gradient: bool) -> None:
         state, metrics = step(state, batch)
         # A copy, because the next step donates the state.
         results["after" if i else "step"] = jax.device_get(_outcome(state, metrics))
-    leaves = jax.tree_util.tree_flatten_with_path(results)[0]
-    arrays = {jax.tree_util.keystr(path): np.asarray(_first_copy(leaf)) for path, leaf in leaves}
+    arrays = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(results)[0]:
+        copy = leaf.addressable_data(0) if isinstance(leaf, jax.Array) else leaf
+        arrays[jax.tree_util.keystr(path)] = np.asarray(copy)
     if process == 0:
         np.savez(out, **arrays)  # type: ignore[arg-type]
 
@@ -136,10 +138,6 @@ def _mapped_step(step: Any, start: TrainState, mesh: Mesh) -> tuple[Any, ...]:
     return jax.tree.map(lambda leaf: leaf[0], _outcome(*pmap_step(step, mesh)(state, batch)))
 
 
-def _first_copy(leaf: Any) -> Any:
-    return leaf.addressable_data(0) if isinstance(leaf, jax.Array) else leaf
-
-
 def work(
     folder: Path, sizes: list[int], processes: int, process: int, port: int, dtype: str, gradient: bool
 ) -> None:
@@ -150,9 +148,8 @@ def work(
     if processes > 1:
         jax.distributed.initialize(f"localhost:{port}", processes, process)
     for size in sizes:
-        measure(
-            folder / f"{size}-{processes}-{dtype}.npz", make_mesh(jax.devices()[:size]), dtype, gradient=gradient
-        )
+        mesh = make_mesh(jax.devices()[:size])
+        measure(folder / f"{size}-{processes}-{dtype}.npz", mesh, dtype, gradient=gradient)
 
 
 def launch(folder: Path, sizes: list[int], processes: int, dtype: str, *, gradient: bool) -> None:
@@ -189,12 +186,14 @@ def _compare(folder: Path, devices: int, processes: int, dtype: str) -> dict[str
 
 def measure_all(args: Args) -> dict[str, Any]:
     """Measure on all meshes and compare."""
-    sizes = [1] if args.quick else [1, 2, 4, 8]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for dtype in ("float64",) if args.quick else ("float32", "float64"):
-            launch(folder, sizes, 1, dtype, gradient=not args.quick)
-            launch(folder, [8], 2, dtype, gradient=not args.quick)
+        if args.quick:
+            launch(folder, [1, 2], 1, "float64", gradient=False)
+        else:
+            for dtype in ("float32", "float64"):
+                launch(folder, [1, 2, 4, 8], 1, dtype, gradient=True)
+                launch(folder, [8], 2, dtype, gradient=True)
         meshes = [file.stem.split("-") for file in sorted(folder.glob("*.npz"))]
         return {"meshes": [_compare(folder, int(d), int(p), dtype) for d, p, dtype in meshes if d != "1"]}
 

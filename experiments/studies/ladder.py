@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from experiments.cached import CachedFrames
-from experiments.changes import SLIM, Change, change
+from experiments.changes import LARGER, SLIM, Change, change
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
@@ -60,8 +60,6 @@ DISTANCES_M = ("0.5", "1.0", "2.0", "4.0")
 _BEHIND_M = 1.0  # Distance of a mark from the object's point.
 _STEP = 8192  # Clouds are padded to its multiples, so that few sizes are compiled.
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
-_SIZES = ("stem", "backbone_blocks", "backbone_widths", "fpn_channels", "head_channels")
-_LARGER = {f"model__{name}": getattr(COMPACT.model, name) for name in _SIZES}
 
 BASE: Change = change(
     name="ladder",
@@ -89,11 +87,11 @@ TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
     "local geometry": change(),
-    "larger": change(**_LARGER),
-    "larger, without local geometry": change(**_LARGER, model__local_geometry=False),
-    MARKED: change(**_LARGER, projection__num_rounds=2),
+    "larger": change(**LARGER),
+    "larger, without local geometry": change(**LARGER, model__local_geometry=False),
+    MARKED: change(**LARGER, projection__num_rounds=2),
     "local geometry, joint": change(refinement=_LOOK),
-    "larger, joint": change(**_LARGER, refinement=_LOOK),
+    "larger, joint": change(**LARGER, refinement=_LOOK),
 }
 TRIALS |= {name: lambda config, first=first: _FROZEN(TRIALS[first](config)) for name, first in AFTERWARDS.items()}
 

@@ -15,15 +15,13 @@ frame, at most 5 % of the detections far from all boxes of their class, a mean c
 import dataclasses
 import json
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 
 from experiments.changes import change
-from experiments.keyframe import read_keyframe
+from experiments.real_frames import read_keyframe
 from experiments.runs import detections, trained
 from experiments.script import Options, real_data, run_measurement
 from fcos_lidar_jax.assignment import owners
@@ -34,7 +32,6 @@ from fcos_lidar_jax.evaluation.matching import candidate_pairs, match_frame
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
 from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.input_pipeline.database import cut_reading
-from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E as SENSOR
@@ -93,20 +90,17 @@ def owned_cells(frame: Frame) -> np.ndarray:
 
 def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:
     started = time.monotonic()
-    prefix = "" if args.detector == "fcos" else f"{args.detector}_"
-    folder, frames = (
-        args.runs / f"{prefix}{args.source}_{seed}",
-        InMemoryFrames((frame,), SENSOR, NUSCENES_CLASSES),
-    )
+    folder = args.runs / f"{args.detector}_{args.source}_{seed}"
+    frames = InMemoryFrames((frame,), SENSOR, NUSCENES_CLASSES)
     detector = trained(folder, CONFIGS[args.detector], frames, steps=args.steps, seed=seed)
     (found,), _ = detections(detector, frames)
     minutes = (time.monotonic() - started) / 60
     predicted, cells = confident(found, MIN_SCORE), owned_cells(frame)
     (boxes, labels, _), counted = predicted, cells >= MIN_CELLS
     # Matched with all boxes, so that the detection of a small box is never matched with a counted one.
-    errors = {"max_distance_m": MAX_DISTANCE_M, "max_heading_error_rad": MAX_HEADING_RAD}
-    period = NUSCENES_METRIC.heading_period_rad
-    match = match_frame(*predicted, frame.boxes, frame.labels, heading_period_rad=period, **errors)
+    limits: dict[str, Any] = {"max_distance_m": MAX_DISTANCE_M, "max_heading_error_rad": MAX_HEADING_RAD}
+    limits["heading_period_rad"] = NUSCENES_METRIC.heading_period_rad
+    match = match_frame(*predicted, frame.boxes, frame.labels, **limits)
     hit = counted[match.truth]
     centres, true_centres = boxes[:, :2], frame.boxes[:, :2]
     near = candidate_pairs(labels, centres, frame.labels, true_centres, max_distance_m=MAX_DISTANCE_M).detection
@@ -141,10 +135,6 @@ def measure(args: Args) -> dict[str, Any]:
     real = args.source == "real"
     how: dict[str, Any] = {"sensor": SENSOR, "reading": cut_reading(1)}
     frame = read_keyframe(real_data(args.data, "nuscenes_scene0061"), **how) if real else make_frame(0, **how)
-    names = Counter(NUSCENES_CLASSES[i] for i in sorted(frame.labels[owned_cells(frame) >= MIN_CELLS]))
-    print("counted boxes:", ", ".join(f"{number} {name}" for name, number in names.items()))
-    shapes = jax.eval_shape(build_detector(CONFIGS[args.detector], SENSOR).init, jax.random.key(0))
-    print("parameters:", count_parameters(shapes["params"])["total"])
     results = []
     for seed in args.seeds:
         results.append(_run(frame, seed, args))

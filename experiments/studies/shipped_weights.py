@@ -49,7 +49,6 @@ import numpy as np
 from experiments.cached import CachedFrames
 from experiments.changes import change
 from experiments.hardware import hardware
-from experiments.mixed import MixedFrames
 from experiments.pool import PooledFrames, simulating
 from experiments.runs import detections, trained
 from experiments.script import Options, compact_json, run_script, save, write_text
@@ -61,13 +60,13 @@ from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.class_mapping import MappedFrames
-from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
+from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
-from fcos_lidar_jax.evaluation.metrics import metric_of
+from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.files import read_json
-from fcos_lidar_jax.inference import load_trained
+from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, KITTI_COMPACT, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
@@ -113,7 +112,7 @@ _MATT_PERIOD = 3
 """Every third street has matt cars, like the simulated drives of the tests. With ``--simulators`` it is about
 every third, since each process simulates streets of one kind, and some are faster."""
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
-_MAX_BYTES = 8 * 2**20
+_AVERAGE_SHARE = 0.3  # Share of the earlier weights in an average.
 _NICE = 10
 _CURVE_FRAMES = 40  # Unseen frames of evaluations during training.
 _STREETS, _POOLED = "streets", "pool.json"  # Folder and record of repeated streets, in the folder of the run.
@@ -131,24 +130,33 @@ class Args(Options):
     seed: int = 1  # Seed of weights and streets; the demo trains with 0.
     batch_size: int = 1  # Frames per update.
     learning_rate: float | None = None  # Peak of the schedule; default: the preset's, for one frame per update.
-    simulators: int = (
-        0  # Processes that simulate streets, which then repeat; default: each frame is another street.
-    )
+    simulators: int = 0  # Processes that simulate streets, which repeat; default: each frame is another street.
     workers: int = 0  # Processes that prepare batches, in addition to a thread.
     warm_start: Path | None = None  # Checkpoint or shipped weights to start from; default: random weights.
     second_look: bool = False  # Train only the second look, with the detector of --warm-start frozen.
     save_every: int = 150  # Steps between two checkpoints.
     export: bool = False  # Write the current weights into the package instead of training.
     average: Path | None = None  # Checkpoint of an earlier training to average the exported weights with.
-    average_share: float = 0.3  # Share of that checkpoint, above 0 and below 1.
     test_frames: int = 200  # Unseen frames for the scores.
 
 
-_TRAINING_OPTIONS = (
-    *("steps", "seed", "batch_size", "learning_rate", "simulators", "workers", "warm_start", "second_look"),
-    *("save_every", "export", "average", "average_share"),
-)
-"""Options that require ``work``."""
+@dataclasses.dataclass(frozen=True)
+class MixedFrames(WrappedFrames):
+    """The frames of one set, except that every ``period``-th is the frame of the same index of another set.
+
+    Everything else comes from the first set.
+    """
+
+    other: FrameSet
+    period: int
+
+    def frame(self, index: int) -> Frame:
+        return (self.frames if index % self.period else self.other).frame(index)
+
+    truth, labels = FrameSet.truth, FrameSet.labels
+
+    def fingerprint(self) -> str:
+        return f"{self.frames.fingerprint()}, every {self.period}: {self.other.fingerprint()}"
 
 
 def streets(config: Config, *, steps: int, seed: int) -> tuple[FrameSet, FrameSet]:
@@ -169,11 +177,10 @@ def streets(config: Config, *, steps: int, seed: int) -> tuple[FrameSet, FrameSe
 def train(args: Args, work: Path) -> dict[str, Any]:
     """Start or resume the run and train to its end."""
     os.nice(_NICE)
-    config = CONFIGS[args.name]
-    given = {"optimizer__batch_size": args.batch_size, "optimizer__peak_learning_rate": args.learning_rate}
-    config = change(**{name: value for name, value in given.items() if value is not None})(config)
-    if args.second_look:
-        config = change(refinement__freeze_detector=True)(config)
+    given: dict[str, Any] = {"optimizer__batch_size": args.batch_size}
+    given |= {} if args.learning_rate is None else {"optimizer__peak_learning_rate": args.learning_rate}
+    given |= {"refinement__freeze_detector": True} if args.second_look else {}
+    config = change(**given)(CONFIGS[args.name])
     # Rejects before hours of training what the export would reject.
     earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
     number = _POOL // config.optimizer.batch_size if args.simulators else args.steps
@@ -181,7 +188,8 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     run = {"steps": args.steps, "seed": args.seed, "weights": args.warm_start, "workers": args.workers}
     if not args.simulators:
         schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
-        trained(work, config, frames, **run, tests=_curve_frames(unseen), schedule=schedule)
+        curve_frames = SelectedFrames(unseen, tuple(range(_CURVE_FRAMES)))
+        trained(work, config, frames, **run, tests=curve_frames, schedule=schedule)
         return training_record(work)
     pool = CachedFrames(frames, work / _STREETS)
     schedule = Schedule(save_every=args.save_every, keep=_KEPT)
@@ -192,20 +200,21 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     return training_record(work)
 
 
-def _curve_frames(unseen: FrameSet) -> FrameSet:
-    return SelectedFrames(unseen, tuple(range(_CURVE_FRAMES)))
-
-
 def curve_of(work: Path) -> list[list[float]]:
     """Score the checkpoints of a run that did not pause for evaluations."""
     curve = []
     for path in Checkpoints(work / CHECKPOINTS).paths():
         detector = load_trained(path)
-        _, unseen = streets(detector.config, steps=1, seed=0)
-        found, frames = detections(detector, _curve_frames(unseen))
-        score = evaluate_frames(found, frames, metric_of(detector.classes)).summary["mean_ap"]
+        score = evaluated(detector, _CURVE_FRAMES).summary["mean_ap"]
         curve.append([load_checkpoint(path).step * detector.config.optimizer.batch_size, round(score, 4)])
     return curve
+
+
+def evaluated(detector: TrainedDetector, number: int) -> Evaluation:
+    """Evaluate a detector on unseen frames."""
+    _, unseen = streets(detector.config, steps=1, seed=0)
+    found, frames = detections(detector, SelectedFrames(unseen, tuple(range(number))))
+    return evaluate_frames(found, frames, metric_of(detector.classes))
 
 
 def training_record(run: Path) -> dict[str, Any]:
@@ -213,8 +222,10 @@ def training_record(run: Path) -> dict[str, Any]:
     checkpoint, spec = load_checkpoint(run), read_json(run / "run.json", dict[str, Any])
     config, done = checkpoint.config, checkpoint.step
     records = [record for record in read_metrics(run) if record["step"] <= done]  # may go on after the checkpoint
-    batch = config.optimizer.batch_size
-    pooled = run / _POOLED
+    batch, look, pooled = config.optimizer.batch_size, config.refinement, run / _POOLED
+    only_look = {}
+    if look is not None and look.freeze_detector:
+        only_look = {"trained": "second look", "num_boxes": look.num_boxes, "num_points": look.num_points}
     return {
         "preset": config.name,
         "parameters": count_parameters(checkpoint.variables["params"])["total"],
@@ -225,21 +236,9 @@ def training_record(run: Path) -> dict[str, Any]:
         "frames_seen": done * batch,
         "seconds_of_steps": round(sum(r.get("seconds", 0.0) for r in records)),
         "curve": [[r["step"] * batch, round(r["test/mAP"], 4)] for r in records if "test/mAP" in r],
-        **_of_second_look(config),
+        **only_look,
         **(read_json(pooled, dict[str, Any]) if pooled.exists() else {}),
     }
-
-
-def _of_second_look(config: Config) -> dict[str, Any]:
-    if config.refinement is None or not config.refinement.freeze_detector:
-        return {}
-    look = config.refinement
-    return {"trained": "second look", "num_boxes": look.num_boxes, "num_points": look.num_points}
-
-
-def is_frozen(config: Config) -> bool:
-    """Whether only the second look was trained."""
-    return config.refinement is not None and config.refinement.freeze_detector
 
 
 def earlier_trainings(name: str, training: Mapping[str, Any], results: Path) -> list[dict[str, Any]]:
@@ -249,29 +248,22 @@ def earlier_trainings(name: str, training: Mapping[str, Any], results: Path) -> 
         return []
     before = read_json(file, dict[str, Any])
     if "training" not in before:
-        raise ValueError(
-            f"{file}: training: missing, expected the training of the weights that this one started from"
-        )
+        raise ValueError(f"{file}: training: missing, expected that of the weights that this one started from")
     return [t for t in (*before["earlier"], before["training"]) if t["seed"] != training["seed"]]
 
 
-def half_precision(checkpoint: Checkpoint) -> Checkpoint:
-    """Convert the weights of a checkpoint to float16; they are read as float32 again."""
-    halved = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), checkpoint.variables)
-    return dataclasses.replace(checkpoint, variables=halved)
-
-
-def averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpoint:
-    """Average the weights of two checkpoints, with a share of the other one.
+def averaged(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
+    """Average the weights of two checkpoints, with a smaller share of the other one.
 
     After training on other streets, the average of old and new weights is often better on both (Wortsman et al.,
     "Robust fine-tuning of zero-shot models", CVPR 2022). The second training must start from the first one.
     """
+    shapes, others = (jax.tree.map(np.shape, c.variables) for c in (checkpoint, other))
+    if shapes != others:
+        raise ValueError("--average: got another network, expected that of --work")
 
     def mean(own: np.ndarray, others: np.ndarray) -> np.ndarray:
-        if own.shape != others.shape:
-            raise ValueError(f"got arrays of shapes {own.shape} and {others.shape}, expected equal shapes")
-        return (1 - share) * np.asarray(own, np.float32) + np.float32(share) * np.asarray(others, np.float32)
+        return (1 - _AVERAGE_SHARE) * np.asarray(own, np.float32) + _AVERAGE_SHARE * np.asarray(others, np.float32)
 
     return dataclasses.replace(checkpoint, variables=jax.tree.map(mean, checkpoint.variables, other.variables))
 
@@ -308,10 +300,7 @@ def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
 def scores(args: Args) -> dict[str, Any]:
     """Score the weights in the package on unseen frames."""
     folder = SHIPPED / args.name
-    detector = load_trained(folder)
-    _, unseen = streets(detector.config, steps=args.steps, seed=args.seed)
-    found, frames = detections(detector, SelectedFrames(unseen, tuple(range(args.test_frames))))
-    evaluation = evaluate_frames(found, frames, metric_of(detector.classes))
+    evaluation = evaluated(load_trained(folder), args.test_frames)
     return {
         "name": args.name,
         "hash": read_description(folder)["hash"],
@@ -329,21 +318,16 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     share = _LOGIT_ADJUSTMENT.get(args.name)
-    if share and not is_frozen(checkpoint.config):  # The logits of a frozen detector are adjusted already.
+    if share and "trained" not in training:  # The logits of a frozen detector are adjusted already.
         checkpoint = with_adjusted_logits(checkpoint, share)
         training["logit_adjustment"] = share
     if args.average is not None:
         other = find_checkpoint(args.average)
-        earlier_weights = load_checkpoint(other)
-        try:
-            checkpoint = averaged(checkpoint, earlier_weights, args.average_share)
-        except ValueError:
-            raise ValueError(f"--average: got another network in {other}, expected that of {work}") from None
-        training["averaged_with"] = {"hash": read_description(other)["hash"], "share": args.average_share}
-    save_checkpoint(folder, half_precision(checkpoint))
+        checkpoint = averaged(checkpoint, load_checkpoint(other))
+        training["averaged_with"] = {"hash": read_description(other)["hash"], "share": _AVERAGE_SHARE}
+    halved = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), checkpoint.variables)
+    save_checkpoint(folder, dataclasses.replace(checkpoint, variables=halved))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    if size > _MAX_BYTES:
-        raise ValueError(f"{folder}: got {size} bytes, expected at most {_MAX_BYTES}")
     record = {"bytes": size, "training": training, "earlier": earlier, **scores(args)}
     write_card(args.name, RESULTS, training=record)
     return record
@@ -351,19 +335,11 @@ def export(args: Args, work: Path) -> dict[str, Any]:
 
 def main(args: Args) -> None:
     """Score, train or export; the next export reads the record of this one."""
-    if not 0 < args.average_share < 1:
-        raise ValueError(f"--average-share: got {args.average_share}, expected above 0 and below 1")
-    if args.average is not None and not args.export:
-        raise ValueError("--average: only for --export")
     if args.second_look and args.warm_start is None:
         raise ValueError("--second-look: expected the detector to freeze in --warm-start")
-    if args.average is None and args.average_share != Args.average_share:
-        raise ValueError("--average-share: only with --average")
     if args.work is None:
-        if changed := [name for name in _TRAINING_OPTIONS if getattr(args, name) != getattr(Args, name)]:
-            raise ValueError(
-                f"--{changed[0].replace('_', '-')}: only for a training, expected its folder in --work"
-            )
+        if args != Args(name=args.name, test_frames=args.test_frames, out=args.out):
+            raise ValueError("--work: missing, expected the folder of the training that the other options are for")
         save(scores(args), args.out)
         return
     record = export(args, args.work) if args.export else train(args, args.work)

@@ -37,7 +37,6 @@ from experiments.script import Options, real_data, run_script, save
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import read_description
-from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.metrics import evaluate
@@ -74,7 +73,6 @@ class Args(Options):
     keyframes: int = 4  # Keyframes per drive.
     seed: int = 77  # Seed of the drives.
     second_look: bool = True  # Use the detector's second look, if it has one.
-    across_classes: bool = False  # NMS across classes: one box per object.
     mirrored: bool = False  # Detect in the view mirrored in x as well, which doubles the time.
     fine_tuning_steps: int = 1000  # Updates, each on one real keyframe.
     work: Path = Path("outputs/transfer")  # Folder of simulated drives and fine-tuning runs.
@@ -99,34 +97,21 @@ def parts(args: Args, detector: TrainedDetector) -> Iterator[tuple[str, FrameSet
         yield from ((name, real[name]) for name in args.only or REAL if name in real)
 
 
-def drives_of(frames: NuScenesFrames) -> list[int]:
-    """Number the drive of each keyframe, from 0."""
-    scenes = [frames.nuscenes.scene_of(token) for token in frames.tokens]
-    return np.unique(scenes, return_inverse=True)[1].tolist()
-
-
 def applied(args: Args, detector: TrainedDetector) -> TrainedDetector:
     """Change the detection of a trained detector as the options say."""
     detector = detector if args.second_look else detector.without_second_look()
-    detector = detector.with_inference(nms_across_classes=True) if args.across_classes else detector
     return detector.with_inference(flips="x") if args.mirrored else detector
 
 
-def measured(
-    detector: TrainedDetector, frames: FrameSet, looked: RefinementConfig | None = None
-) -> dict[str, Any]:
-    """Score a detector on frames by range, and on simulated drives also with the official metrics.
-
-    For a detector without its second look ``looked``, also the share of boxes that this would drop.
-    """
+def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
+    """Score a detector on frames by range, and on simulated drives also with the official metrics."""
     found, visited = detections(detector, frames)
-    drives = drives_of(frames) if isinstance(frames, NuScenesFrames) else None
+    drives = None
+    if isinstance(frames, NuScenesFrames):
+        scenes = [frames.nuscenes.scene_of(token) for token in frames.tokens]
+        drives = np.unique(scenes, return_inverse=True)[1].tolist()
     scores = scores_by_range(found, visited, repeats=_REPEATS, groups=drives)
     record: dict[str, Any] = {"keyframes": len(visited), **scores, "overlapping": overlapping_share(found)}
-    if looked is not None and detector.config.refinement is None:
-        numbers = np.array([d.valid.sum() for d in found])
-        beyond = np.maximum(numbers - looked.num_boxes, 0).sum() / max(numbers.sum(), 1)
-        record["beyond num_boxes"] = round(float(beyond), 4)
     if isinstance(frames, NuScenesFrames):
         results = {
             token: result_entries(boxes, token, frames.nuscenes.sensor_to_global(token), detector.classes)
@@ -147,8 +132,7 @@ def overlapping_share(found: Sequence[Detections]) -> float:
 
     >>> boxes, both = np.zeros((3, 9)) + [0, 0, 0, 4, 2, 1, 0, 0, 0], np.ones(3, bool)
     >>> boxes[2, 0] = 9.0
-    >>> share = overlapping_share([Detections(boxes, np.ones(3), np.array([0, 1, 1]), both, np.zeros(0))])
-    >>> share  # the first two of three
+    >>> overlapping_share([Detections(boxes, np.ones(3), np.array([0, 1, 1]), both, np.zeros(0))])
     0.6667
     """
     shown, overlapping = 0, 0
@@ -196,17 +180,15 @@ def main(args: Args) -> None:
     """Measure the selected parts and save after each."""
     if unknown := {*args.only} - {"simulated", "fine_tuning", *REAL}:
         raise ValueError(f"--only: got {min(unknown)!r}, expected simulated, fine_tuning, or one of {REAL}")
-    loaded, folder = load_trained(args.checkpoint), find_checkpoint(args.checkpoint)
-    looked = loaded.config.refinement
-    detector = applied(args, loaded)
+    detector = applied(args, load_trained(args.checkpoint))
     out = args.out or Path("outputs/transfer.json")
-    described = read_description(folder)
+    described = read_description(find_checkpoint(args.checkpoint))
     of = {"name": str(args.checkpoint), "step": described["step"], "hash": described["hash"]}
     record = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
     if record.get("checkpoint") != of:
         record = {"checkpoint": of}
     for name, frames in parts(args, detector):
-        record[name] = measured(detector, frames, looked)
+        record[name] = measured(detector, frames)
         if name == "simulated":
             record["drives"] = {n: getattr(args, n) for n in ("scenes", "keyframes", "seed")}
         save(record, out, f"{name}: mAP {record[name]['all']['mAP']} on {len(frames)} keyframes")

@@ -23,11 +23,6 @@ class SimulatedFrames(FrameSet):
     learn from them. Ten sweeps of fast traffic are a stress test for sweep fusion: the ego vehicle and the objects
     move fast, and most cells hold points of several sweeps. Annotations depend on the points, so :meth:`truth`
     computes the whole frame.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> frames = SimulatedFrames(TINY, number=2)
-    >>> len(frames), frames.frame(1).points.shape[1]
-    (2, 5)
     """
 
     sensor: Sensor

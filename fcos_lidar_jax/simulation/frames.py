@@ -37,11 +37,6 @@ def make_frame(
         reach_m: maximum distance of the objects along the street; by default 80 % of the sensor's range limit.
         min_points: objects with fewer points in the current sweep are not annotated.
         reading: the sweeps to fuse, see :func:`scan_sweeps`; the world moves between sweeps.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> a, b = make_frame(3, TINY), make_frame(3, TINY)
-    >>> bool((a.points == b.points).all()), bool((a.num_points >= 1).all())
-    (True, True)
     """
     rng = np.random.default_rng([seed, 0xF0C5])
     mix = rng.spawn(1)[0]

@@ -61,11 +61,7 @@ def scene_name(index: int) -> str:
 
 
 def sweep_file(seed: int, index: int, number: int) -> str:
-    """Path of the point file of a sweep in its data set.
-
-    >>> sweep_file(0, 0, 10)
-    'samples/LIDAR_TOP/sim-0-0001__LIDAR_TOP__1700000600500000.pcd.bin'
-    """
+    """Path of the point file of a sweep in its data set."""
     folder = "sweeps" if number % SWEEPS_PER_KEYFRAME else "samples"
     return f"{folder}/{CHANNEL}/{_logfile(seed, index)}__{CHANNEL}__{_timestamp_us(index, number)}.pcd.bin"
 

@@ -51,7 +51,8 @@ def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[]
     world = sample_scene(rng, spec)
     traffic = world.traffic
     sensor_to_ego = sample_mount(rng, spec.sensor, streets=spec.streets)
-    street_to_global = _sample_placement(rng)
+    street_to_global = about_z(rng.uniform(-np.pi, np.pi))
+    street_to_global[:2, 3] = rng.uniform(300, 2000, 2)
     mount, egos = pose_fields(sensor_to_ego), []
     boxes, counts, shares, attributes = [], [], [], []
     for number in range(spec.sweeps):
@@ -86,13 +87,6 @@ def sample_scene(rng: np.random.Generator, spec: DatasetSpec) -> World:
     return sample_world(
         rng, reach_m=reach, beyond_m=1.2 * reach, duration_s=duration, labels=labels, streets=spec.streets
     )
-
-
-def _sample_placement(rng: np.random.Generator) -> np.ndarray:
-    """Random pose of the street frame in the global frame, with rotation about z only, f64[4, 4]."""
-    placement = about_z(rng.uniform(-np.pi, np.pi))
-    placement[:2, 3] = rng.uniform(300, 2000, 2)
-    return placement
 
 
 def _pose(row: Row) -> np.ndarray:

@@ -16,7 +16,7 @@ from fcos_lidar_jax.simulation.objects import (
     vary_shape,
 )
 from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, SOLID, make_solids, place_solids
-from fcos_lidar_jax.simulation.streets import PLAIN, Streets
+from fcos_lidar_jax.simulation.streets import Streets
 
 _LEAVES = 0.55  # density of foliage
 _FENCES = ((0.08, 5.0), (0.24, np.inf), (0.24, np.inf), (0.8, 2.5))
@@ -44,7 +44,7 @@ def sample_scenery(
     high: np.ndarray,
     *,
     beyond_m: float,
-    streets: Streets = PLAIN,
+    streets: Streets,
 ) -> np.ndarray:
     """Sample scenery on both sides of both streets, solids [s] of :data:`SOLID` in the street frame.
 
@@ -54,7 +54,9 @@ def sample_scenery(
         beyond_m: extent of the scenery around the path.
     """
     parts = [np.zeros(0, SOLID)]
-    setting = _sample_setting(surroundings) if streets.setting else "city"
+    setting = "city"
+    if streets.setting:
+        setting = str(surroundings.choice(list(_SETTINGS), p=list(_SETTINGS.values())))
     plain = [] if streets.facades else [houses]
     plain += [_fences, _rows_of_trees, _poles]
     for along, across in ((0, 0.0), (1, ground.crossing_x)):
@@ -85,10 +87,6 @@ def sample_side(rng: Generator, side: Side, streets: Streets, setting: str) -> n
         parts += _clutter(cluttered, side, dense, setback)
         parts += _wires(cluttered, side)
     return np.concatenate(parts)
-
-
-def _sample_setting(rng: Generator) -> str:
-    return str(rng.choice(list(_SETTINGS), p=list(_SETTINGS.values())))
 
 
 def _spaced(rng: Generator, span: tuple[float, float], mean: float) -> np.ndarray:

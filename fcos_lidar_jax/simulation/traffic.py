@@ -11,7 +11,7 @@ from fcos_lidar_jax.data.box_geometry import footprints_overlap
 from fcos_lidar_jax.simulation.ground import LANE_M, Ground
 from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, travelled
 from fcos_lidar_jax.simulation.objects import ObjectModel, sample_object_model, sample_size
-from fcos_lidar_jax.simulation.streets import PLAIN, Streets
+from fcos_lidar_jax.simulation.streets import Streets
 
 # Places of each class with their probabilities. The first place is the one with moving objects, if there is any.
 _PLACES: dict[str, tuple[tuple[str, float], ...]] = {
@@ -65,7 +65,7 @@ def sample_traffic(
     duration_s: float,
     fused: bool,
     fast_traffic: bool,
-    streets: Streets = PLAIN,
+    streets: Streets,
 ) -> Traffic:
     """Sample objects that never touch each other, the ego vehicle or the scenery.
 
@@ -109,13 +109,9 @@ def sample_traffic(
                 objects.append((label, model, size, motion, place in _PARKED))
                 pedestrian = motion if name == "pedestrian" else pedestrian
                 break
-    return _collected(objects)
-
-
-def _collected(objects: Sequence[tuple[int, ObjectModel, np.ndarray, np.ndarray, bool]]) -> Traffic:
-    labels, models, sizes, motions, parked = zip(*objects, strict=True) if objects else [()] * 5
+    placed, models, sizes, motions, parked = zip(*objects, strict=True) if objects else [()] * 5
     return Traffic(
-        np.array(labels, np.int32),
+        np.array(placed, np.int32),
         models,
         np.array(sizes).reshape(-1, 3),
         np.concatenate([np.zeros(0, MOTION), *motions]),

@@ -20,25 +20,24 @@ SECTOR = RESULTS / "tables" / "sector"
 CELL = {"changes": "base", "seed": 0, "scores": {"mAP": 0.1, "AP": {}, "curve": [[1, 0.1]]}, "git": "1234567"}
 
 
-def test_the_tables_of_today_find_every_committed_cell(tmp_path):
-    scale = quarter(tmp_path)
-    rows = [row for table in (*TABLES.values(), *study_tables()) for row in table.rows]
-    known = {changes_of(row.change(scale.base), scale.base) for row in rows}
+def test_committed_tables_are_those_of_their_cells_and_of_the_rows_of_today(tmp_path):
+    scale, tables = quarter(tmp_path), {table.name: table for table in (*TABLES.values(), *study_tables())}
+    changes = {
+        (name, row.label): changes_of(row.change(scale.base), scale.base)
+        for name, table in tables.items()
+        for row in table.rows
+    }
     cells = read_cells(SECTOR, scale)
-    lines = (SECTOR / "cells.csv").read_text().splitlines()
-    assert len(cells) == len(lines) - 1 > 20
-    assert {changes for changes, _ in cells} <= known
-
-
-@pytest.mark.parametrize("file", sorted(SECTOR.glob("*.md")), ids=lambda file: file.stem)
-def test_a_committed_table_is_that_of_its_cells(tmp_path, file):
-    scale, record = quarter(tmp_path), json.loads(file.with_suffix(".json").read_text())
-    (table,) = [t for t in (*TABLES.values(), *study_tables()) if t.name == record["table"]]
-    table, cells = table.only(tuple(row["label"] for row in record["rows"])), read_cells(SECTOR, scale)
-    configs = {row.label: changes_of(row.change(scale.base), scale.base) for row in table.rows}
-    by_row = {label: [cells[own, seed] for seed in record["seeds"]] for label, own in configs.items()}
-    again = make_record(table, record["scale"], scale, by_row, record["figures"])
-    assert as_markdown(table, again) == file.read_text()
+    assert len(cells) == len((SECTOR / "cells.csv").read_text().splitlines()) - 1 > 20
+    assert {name for name, _ in cells} <= {*changes.values()}
+    files = sorted(SECTOR.glob("*.md"))
+    assert len(files) == 5
+    for file in files:
+        record = json.loads(file.with_suffix(".json").read_text())
+        table = tables[record["table"]].only(tuple(row["label"] for row in record["rows"]))
+        by_row = {r.label: [cells[changes[table.name, r.label], s] for s in record["seeds"]] for r in table.rows}
+        again = make_record(table, record["scale"], scale, by_row, record["figures"])
+        assert as_markdown(table, again) == file.read_text(), file
 
 
 def test_cells_are_identified_by_their_changes():
@@ -75,16 +74,16 @@ def test_cells_of_another_scale_are_refused_and_the_field_is_named(tmp_path):
 
 
 def test_a_later_field_of_the_configuration_refuses_only_what_it_changes(tmp_path):
-    scale = Pretended()
+    earlier = {(section, field): v for section, fields in LATER_FIELDS.items() for field, v in fields.items()}
+    defaults = {f"{section}__{field}": value for (section, field), value in earlier.items()}
+    scale = Pretended(base=change(**defaults)(QUICKSTART))
     add_cell(tmp_path, scale, CELL, locks=tmp_path)
     file = tmp_path / "scale.json"
     record = json.loads(file.read_text())
-    for section, fields in LATER_FIELDS.items():
-        for field in fields:
-            record["base"][section].pop(field, None)
+    for section, field in earlier:
+        record["base"][section].pop(field, None)
     file.write_text(json.dumps(record))
-    earlier = {f"{section}__{field}": v for section, fields in LATER_FIELDS.items() for field, v in fields.items()}
-    assert read_cells(tmp_path, dataclasses.replace(scale, base=change(**earlier)(QUICKSTART)))
-    flipped = dataclasses.replace(scale, base=change(**earlier | {"inference__flips": "y"})(QUICKSTART))
+    assert read_cells(tmp_path, scale)
+    flipped = dataclasses.replace(scale, base=change(**defaults | {"inference__flips": "y"})(QUICKSTART))
     with pytest.raises(ValueError, match=r"base\.inference\.flips: got 'none', expected 'y'"):
         read_cells(tmp_path, flipped)

@@ -79,9 +79,7 @@ def test_a_table_names_the_seeds_that_each_difference_needs():
         scale = Pretended()
         return tables.as_markdown(table, tables.make_record(table, "sector", scale, cells, {}))
 
-    assert "mAP would exclude zero, if the mean and the deviation (in brackets) of the differences stay: " in text(
-        3
-    )
+    assert "mAP would exclude zero, if " in text(3)
     assert ": three: 4 (1.00).\n" in text(3)
     assert ": three: over 100 (1.00).\n" in text(3)
     assert "would exclude zero" not in text(2)
@@ -108,40 +106,26 @@ def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_ta
 
 
 @pytest.mark.parametrize(
-    ("labels", "fields", "message"),
-    [
-        (("untied",), {}, "got 'tied', expected one of ['untied']"),
-        (("tied", "tied"), {}, "got two rows 'tied'"),
-        (("tied", "untied"), {"reference": "Tied"}, "reference: got 'Tied', expected one of"),
-        (("tied", "untied"), {"paper": "Untied"}, "paper: got 'Untied', expected one of"),
-        (("tied", "untied"), {"gain": "of_it"}, "gain: got 'of_it', expected one of"),
-    ],
+    ("labels", "reference"), [(("untied",), None), (("tied", "tied"), None), (("tied", "untied"), "Tied")]
 )
-def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, fields, message):
-    rows = tuple(Row(label, change(), **fields) for label in labels)
-    with pytest.raises(ValueError, match=re.escape(message)):
+def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, reference):
+    rows = tuple(Row(label, change(), reference=reference) for label in labels)
+    with pytest.raises(ValueError, match=f"table table6: got rows .*{labels[0]}.*, expected different ones, with"):
         dataclasses.replace(TABLES["table6"], rows=rows)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different seeds of at least 0"),
-        (["--simulators", "-1"], "--simulators: got -1, expected at least 0"),
-        (
-            ["--scale", "nuscenes", "--simulators", "2"],
-            "--simulators: only for simulated frames, got --scale nuscenes",
-        ),
+        (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different seeds"),
         (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/cloud.f16.bin there"),
-        (["--data-root", "nowhere"], "--data-root: only for --scale nuscenes, got --scale smoke"),
         (["--scale", "sector", "--steps", "5"], "--steps: only for --scale nuscenes, got --scale sector"),
         (["--tables", "table9"], f"--tables: got 'table9', expected some of {', '.join(TABLES)}"),
         (
             ["--tables", "table1", "table2", "--rows", "base"],
             "--rows: got ['base'], expected none unless --tables names one table",
         ),
-        (["--scale", "nuscenes"], "--data-root: missing, expected the data set for --scale nuscenes"),
-        (["--scale", "nuscenes", "--data-root", "nowhere"], "nowhere: no such folder, expected a data set"),
+        (["--scale", "nuscenes"], "data root: missing, expected the folder of a data set"),
     ],
 )
 def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_path, options, message):
@@ -153,20 +137,17 @@ def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_row_of_the_tables_has_its_paper_figures():
+def test_every_row_has_its_own_configuration_and_its_paper_figures():
     for table in list(TABLES.values())[:6]:
-        paper = PAPER["tables"][table.name]["rows"]
-        assert [row.paper for row in table.rows] == list(paper)
-        assert table.reference in [row.label for row in table.rows]
+        assert [row.paper for row in table.rows] == list(PAPER["tables"][table.name]["rows"])
         configs = [row.change(NUSCENES) for row in table.rows]
         assert len(set(configs)) == len(configs)
         assert NUSCENES in configs  # the paper's detector is a row of every table
 
 
 def test_every_row_of_a_study_can_be_trained(tmp_path):
-    scale, found = smoke(tmp_path), study_tables()
-    assert found
-    for table in found:
+    scale = smoke(tmp_path)
+    for table in study_tables():
         configs = [row.change(scale.base) for row in table.rows]
         assert len(set(configs)) == len(configs), table.name
         for config in configs:

@@ -6,7 +6,8 @@ import pytest
 from experiments.benchmarks import latency, mrv_figures
 from experiments.paper import PAPER
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 
 ROWS = {name: table["rows"] for name, table in PAPER["tables"].items()}
 
@@ -25,7 +26,10 @@ def test_rows_are_complete_and_their_classes_average_to_the_map(table):
 
 
 def test_counts_of_a_small_cloud():
-    """Three points in a cell, the nearest of an older sweep: what is kept can be counted by hand."""
+    """Three points in a cell, the nearest of an older sweep: what is kept can be counted by hand.
+
+    ``test_projection.py`` counts a real cloud.
+    """
     cloud = np.zeros((4, 5), np.float32)
     cloud[:3, 1] = 9, 5, 7
     cloud[1:3, 4] = 0.1
@@ -38,6 +42,13 @@ def test_counts_of_a_small_cloud():
     assert found["prioritized"]["percent"] == {"1": 33.33, "2": 66.67, "5": 100.0}
 
 
+def test_ten_sweeps_are_loaded_for_a_preset_of_one():
+    with latency.simulated_sweeps(TINY) as (drive, token):
+        points = latency.load(drive, token, QUICKSTART, TINY, "multi")
+    assert len(points) == latency.ROWS["multi"]
+    assert len(np.unique(points[:, 4])) == 10
+
+
 def test_times_have_every_row_and_ratios_to_the_first(monkeypatch):
     monkeypatch.setitem(latency.ROWS, "multi", 64)
     monkeypatch.setitem(latency.ROWS, "single", 64)
@@ -47,13 +58,3 @@ def test_times_have_every_row_and_ratios_to_the_first(monkeypatch):
     for setting in times.values():
         assert setting["1"]["ratio"] == 1
         assert 0 < setting["2"]["median_ms"] <= setting["2"]["p99_ms"]
-
-
-@pytest.mark.real_data
-def test_the_real_cloud_is_counted_where_it_exists(real_data):
-    """More counts of this cloud are in ``test_projection.py``."""
-    cloud, label = latency.fused_cloud(real_data, NUSCENES_HDL32E)
-    counts = mrv_figures.kept_by_rounds(cloud, NUSCENES_HDL32E, close="none")
-    assert label == "real ten-sweep cloud"
-    assert counts["in_range"] == pytest.approx(236_510, abs=12)
-    assert counts["prioritized"]["kept"]["1"] == pytest.approx(28_195, abs=12)

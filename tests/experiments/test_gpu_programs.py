@@ -7,17 +7,13 @@ import subprocess
 import pytest
 
 from experiments.benchmarks import gpu_programs
-from experiments.benchmarks.gpu_programs import PROGRAMS, Args, check, count_kernels
+from experiments.benchmarks.gpu_programs import PROGRAMS, Args, Program, check, count_kernels
 from experiments.hardware import hardware
-from fcos_lidar_jax.presets import PRESETS
+from fcos_lidar_jax.presets import QUICKSTART
 
 pytestmark = pytest.mark.slow
 
 MODULE = """HloModule jit_step
-
-%fused (p: f32[4]) -> f32[4] {
-  ROOT %a = f32[4]{0} add(%p, %p)
-}
 
 %inner (t: (s32[], f32[4])) -> (s32[], f32[4]) {
   %f1 = f32[4]{0} fusion(%x), kind=kLoop, calls=%fused
@@ -28,7 +24,6 @@ MODULE = """HloModule jit_step
   %f2 = f32[4]{0} fusion(%x), kind=kLoop, calls=%fused
   %s = f32[4]{0} sort(%f2), dimensions={0}
   %w2 = (s32[], f32[4]{0}) while(%t), condition=%c, body=%inner
-  ROOT %t2 = (s32[], f32[4]{0}) tuple(%i, %s)
 }
 
 %few (p: f32[4]) -> f32[4] {
@@ -56,20 +51,13 @@ def test_kernels_are_counted_by_loop_and_of_branches_the_larger():
     assert loops == [(5, 2), (None, 1)]
 
 
-@pytest.mark.parametrize("name", ["train-nuscenes-8-devices", "detect-nuscenes"])
-def test_programs_match_the_package(name):
+def test_programs_match_the_package():
     """Shapes of the arguments, which of them are split over the devices, and what is given away."""
-    program = PROGRAMS[name]
-    function, given, split, donated = gpu_programs._function(program)
-    config = PRESETS[program.preset]
-    assert callable(function)
-    assert len(given) == len(split)
-    if program.kind == "train":
-        assert given[1].points.shape[:2] == (program.batch, config.max_points)
-        assert (split, donated) == ((False, True), (0,))
-    else:
-        assert given[1].shape[0] == config.max_points
-        assert (split, donated) == ((False,) * 3, ())
+    points = QUICKSTART.max_points
+    _, (_, batch), split, donated = gpu_programs._function(Program("train", "quickstart", batch=2, devices=2))
+    assert (batch.points.shape[:2], split, donated) == ((2, points), (False, True), (0,))
+    _, given, split, donated = gpu_programs._function(Program("detect", "quickstart"))
+    assert (given[1].shape[0], split, donated) == (points, (False,) * 3, ())
 
 
 def test_a_program_that_kills_the_compiler_is_reported_in_its_line(tmp_path, monkeypatch, capsys):
@@ -77,10 +65,9 @@ def test_a_program_that_kills_the_compiler_is_reported_in_its_line(tmp_path, mon
     good = {**dataclasses.asdict(PROGRAMS["detect-compact"]), "seconds": 3, "gflop_per_frame": 2.0, "slow": 0}
     good |= {"temporary_mib": 5, "kernels": 7, "loops": [[5, 2], [None, 4]]}
     runs = iter([(0, json.dumps(good), ""), (-6, "", "one\nF 1 x.cc:627] Check failed: a == b (1 vs. 2)\nstack")])
-    environments = []
 
     def compiled(command, *, env, **options):
-        environments.append(env)
+        assert env["PYTHONPATH"].startswith(str(tmp_path))
         return subprocess.CompletedProcess(command, *next(runs))
 
     hardware()  # Before its own processes are replaced.
@@ -93,8 +80,4 @@ def test_a_program_that_kills_the_compiler_is_reported_in_its_line(tmp_path, mon
     assert "loops 5x2 ?x4" in first
     assert second.endswith("FAILED: exit code -6: F 1 x.cc:627] Check failed: a == b (1 vs. 2)")
     assert last == "1 of 2 programs compile as they should"
-    assert list(json.loads((tmp_path / "record.json").read_text())["programs"]) == [
-        "detect-compact",
-        "train-compact",
-    ]
-    assert environments[0]["PYTHONPATH"].startswith(str(tmp_path))
+    assert list(json.loads(args.out.read_text())["programs"]) == list(args.programs)

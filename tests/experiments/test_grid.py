@@ -10,21 +10,20 @@ from experiments.changes import change
 from experiments.paper_tables import grid
 from experiments.paper_tables.cells import run_name
 from experiments.paper_tables.grid import run_cell, run_cells
-from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import QUICKSTART
 
 
-def test_a_finished_cell_is_never_run_again(tmp_path):
-    scale, folders = Pretended(), {"results": tmp_path, "runs": tmp_path}
+def test_a_finished_or_diverged_cell_is_never_run_again(tmp_path):
+    scale, folders = Pretended(diverges=((3, 2),)), {"results": tmp_path, "runs": tmp_path}
     three = change(projection__num_rounds=3)(QUICKSTART)
-    first = run_cell(three, scale, 1, **folders)
-    assert run_cell(dataclasses.replace(three, name="other"), scale, 1, **folders) == first
-    assert scale.asked == 1
-    run_cell(three, scale, 2, **folders)
+    for config in (three, dataclasses.replace(three, name="other")):
+        first, second = (run_cell(config, scale, seed, **folders) for seed in (1, 2))
     assert scale.asked == 2
     assert first["changes"] == "projection.num_rounds=3"
     assert {"jax", "git", "device", "seed"} <= set(first)
+    assert first["scores"]["mAP"] == pytest.approx(0.31)
+    assert second["diverged"] == "step 7: loss/l1 is not finite"
 
 
 def test_a_cell_names_the_revisions_of_all_who_trained_it(tmp_path, monkeypatch):
@@ -57,12 +56,3 @@ def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch)
         records = run_cells([(held, 0), (free, 0)], scale, **folders)
     assert [record["scores"]["mAP"] for record in records] == pytest.approx([0.3, 0.5])
     assert scale.asked == 2
-
-
-def test_a_state_that_is_not_finite_is_a_result_too(tmp_path):
-    class Overflows(Pretended):
-        def score(self, config, seed, folder):
-            raise NonFiniteStateError("checkpoints/00000007: not saved: var: not finite")
-
-    record = run_cell(QUICKSTART, Overflows(), 0, results=tmp_path, runs=tmp_path)
-    assert record["diverged"] == "checkpoints/00000007: not saved: var: not finite"

@@ -5,10 +5,12 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+import tiny_run
+from linear_network import linear_network
 
 from experiments.benchmarks.latency import stage_calls
 from experiments.changes import change
-from experiments.paper_tables.scales import quarter, smoke
+from experiments.paper_tables.scales import quarter
 from experiments.studies import centerpoint
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import make_cloud
@@ -35,13 +37,13 @@ def test_both_detectors_share_all_but_themselves(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_stages_that_are_timed_are_the_detector(tmp_path):
-    scale = smoke(tmp_path)
-    points = scale.clouds(scale.base.num_sweeps)[0]
-    config = change(inference__min_probability=0.0)(scale.base)  # random weights are sure of nothing
-    detector = build_detector(config, scale.sensor)
-    variables = detector.init(jax.random.key(0))
-    calls = stage_calls(detector, variables, make_cloud(points, config, sensor=scale.sensor, num_close=0))
+def test_the_stages_that_are_timed_are_the_detector():
+    config = change(inference__min_probability=0.0)(tiny_run.CONFIG)  # random weights are sure of nothing
+    with linear_network():
+        detector = build_detector(config, tiny_run.SENSOR)
+        variables = detector.init(jax.random.key(0))
+    cloud = make_cloud(tiny_run.FRAMES.frame(0).points, config, sensor=tiny_run.SENSOR, num_close=0)
+    calls = stage_calls(detector, variables, cloud)
     whole = calls["points to boxes, one program"]()
     assert whole.valid.any()
     expected = whole.boxes, whole.scores, whole.labels, whole.valid

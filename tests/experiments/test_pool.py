@@ -1,4 +1,4 @@
-"""The pool of frames: only frames that exist are drawn, processes fill it, a training from it resumes."""
+"""The pool of frames: only frames that exist are drawn, and processes fill it."""
 
 import multiprocessing
 
@@ -17,7 +17,8 @@ def cache(tmp_path):
     return CachedFrames(FRAMES, tmp_path / "streets")
 
 
-def test_frames_that_exist_are_repeated(cache):
+def test_frames_that_exist_are_repeated_and_new_ones_are_found(cache, monkeypatch):
+    monkeypatch.setattr("experiments.pool._FRESH_S", 1e-4)
     for index in (1, 4):
         cache.frame(index)
     pool = PooledFrames(cache, least=2)
@@ -25,15 +26,8 @@ def test_frames_that_exist_are_repeated(cache):
     assert [pool.name(index) for index in range(5)] == [FRAMES.name(i) for i in (1, 4, 1, 4, 1)]
     assert (pool.frame(3).points == FRAMES.frame(4).points).all()
     assert cache.made() == [1, 4]
-
-
-def test_new_frames_are_found(cache, monkeypatch):
-    monkeypatch.setattr("experiments.pool._FRESH_S", 1e-4)
-    pool = PooledFrames(cache, least=1)
-    cache.frame(0)
-    assert pool.name(5) == FRAMES.name(0)
-    cache.frame(3)
-    assert pool.name(5) == FRAMES.name(3)
+    cache.frame(5)
+    assert pool.name(5) == FRAMES.name(5)
 
 
 @pytest.mark.slow

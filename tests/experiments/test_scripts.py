@@ -36,11 +36,9 @@ def test_the_help_of_a_script_names_its_command(script, monkeypatch, tmp_path, c
     ("script", "options", "message"),
     [
         ("studies.centerpoint", ["--scale", "nuscenes"], "--scale: got nuscenes, expected smoke or sector"),
-        ("studies.mrv_ablations", ["--scale", "nuscenes"], "--scale: got nuscenes, expected smoke or sector"),
-        ("studies.mrv_ablations", ["--epochs", "0"], "--epochs: got 0, expected at least 1"),
         ("studies.ladder", ["--trials", "base", "magic"], "--trials: got 'magic', expected some of base,"),
         ("studies.overfit_keyframe", [], "--data: missing, expected the folder that holds nuscenes_scene0061/"),
-        ("studies.shipped_weights", ["--name", "hdl32e", "--export"], "--export: only for a training,"),
+        ("studies.shipped_weights", ["--name", "hdl32e", "--export"], "--work: missing, expected the folder"),
         ("benchmarks.gpu_programs", ["--plugin", "."], "--plugin: .: no nvidia/cuda_nvcc there: run bash .ci/gpu"),
     ],
 )

@@ -9,13 +9,15 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from linear_network import linear_network
 from tiny_run import TINY_CONFIG, untrained
 
 from experiments.changes import change
 from experiments.real_frames import SPANS_M, scores_by_range, within
 from experiments.studies import model_card, shipped_weights, transfer
-from experiments.studies.shipped_weights import with_adjusted_logits
+from experiments.studies.shipped_weights import MixedFrames, with_adjusted_logits
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
@@ -50,58 +52,11 @@ def test_a_span_holds_the_boxes_of_its_distances(near, far):
     for before, after, d, e in zip(frames, rest, found, chosen, strict=True):
         distances = [math.sqrt(float(x) ** 2 + float(y) ** 2) for x, y in before.boxes[:, :2]]
         kept = [i for i, distance in enumerate(distances) if near <= distance < far]
-        np.testing.assert_array_equal(after.boxes, before.boxes[kept])
-        np.testing.assert_array_equal(after.labels, before.labels[kept])
-        np.testing.assert_array_equal(after.num_points, before.num_points[kept])
+        for name in ("boxes", "labels", "num_points"):
+            np.testing.assert_array_equal(getattr(after, name), getattr(before, name)[kept])
         for i, box in enumerate(d.boxes):
             inside = near <= math.sqrt(float(box[0]) ** 2 + float(box[1]) ** 2) < far
             assert e.valid[i] == (d.valid[i] and inside)
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory) -> Path:
-    """A run of three steps, its weights exported into a package elsewhere, and the record of their scores."""
-    home = tmp_path_factory.mktemp("home")
-    run = home / "run"
-    (run / "checkpoints").mkdir(parents=True)
-    (home / "weights").mkdir()
-    weights = jax.tree.map(lambda leaf: leaf + np.float32(1e-4), untrained(CONFIG, TINY))
-    save_checkpoint(run / "checkpoints" / "00000003", Checkpoint(CONFIG, TINY, weights, 3))
-    (run / "run.json").write_text(json.dumps({"seed": 4, "weights": None, "steps": 9}))
-    lines = ({"step": s, "loss/total": 1.0, "seconds": 2.0} for s in (1, 2, 3))
-    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.MonkeyPatch.context() as patch:
-        place_package(patch, home)
-        shipped_weights.main(shipped_weights.Args(name="hdl32e", work=run, export=True, test_frames=2))
-    return home
-
-
-def place_package(patch: pytest.MonkeyPatch, home: Path) -> None:
-    for module in (shipped_weights, model_card):
-        patch.setattr(module, "SHIPPED", home / "weights")
-    patch.setattr(shipped_weights, "RESULTS", home / "results")
-    patch.setattr(shipped_weights, "_CURVE_FRAMES", 1)
-
-
-@pytest.fixture
-def shipped(exported, tmp_path, monkeypatch):
-    """A copy of the run and its exported weights; returns the package's folder and the record."""
-    shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
-    place_package(monkeypatch, tmp_path)
-    return tmp_path / "weights", json.loads((tmp_path / "results" / "hdl32e.json").read_text())
-
-
-@pytest.mark.slow
-def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
-    package, record = shipped
-    exported, run = (load_checkpoint(p) for p in (package / "hdl32e", tmp_path / "run/checkpoints/00000003"))
-    run = with_adjusted_logits(run, 0.5)
-    for a, b in zip(*(jax.tree.leaves(c.variables) for c in (exported, run)), strict=True):
-        assert a.dtype == np.float32
-        np.testing.assert_array_equal(a, np.asarray(b).astype(np.float16).astype(np.float32))
-    training = record["training"]
-    assert (training["steps"], training["steps_planned"], training["frames_seen"]) == (3, 9, 6)
-    assert training["seconds_of_steps"] == 6
 
 
 def test_every_third_training_street_has_matt_cars_like_the_tests():
@@ -110,14 +65,23 @@ def test_every_third_training_street_has_matt_cars_like_the_tests():
     assert [frames.streets.gloss for frames in (shown.frames, shown.other, unseen)] == [1, 0, 0]
 
 
+def test_frames_of_two_sets_are_mixed():
+    first, other = SimulatedFrames(TINY, 4), SimulatedFrames(TINY, 4, num_objects=3)
+    mixed = MixedFrames(first, other, 3)
+    for index in range(4):
+        expected = (first if index % 3 else other).frame(index)
+        assert (mixed.frame(index).points == expected.points).all()
+        assert (mixed.truth(index).boxes == expected.boxes).all()
+        assert mixed.labels(index).tolist() == expected.labels.tolist()
+    assert (len(mixed), mixed.name(3)) == (4, first.name(3))
+
+
 def test_logits_are_adjusted_for_the_class_frequencies_of_nuscenes():
     """Closed form: the training's frequencies are nuScenes' to the power of 0.25, up to a constant factor."""
-    before = Checkpoint(CONFIG, TINY, untrained(CONFIG, TINY), 1)
-    after = with_adjusted_logits(before, 0.4)
-    old, new = (dict(jax.tree_util.tree_leaves_with_path(c.variables)) for c in (before, after))
-    changed = {path: new[path] - old[path] for path in old if not np.array_equal(old[path], new[path])}
-    assert [path[-1].key for path in changed] == ["logits_bias"]  # the tiny network has one head for all levels
-    ((*classes, background),) = changed.values()
+    weights = {"heads": {"logits_bias": np.zeros(11), "iou_bias": np.zeros(1)}}
+    after = with_adjusted_logits(Checkpoint(CONFIG, TINY, weights, 1), 0.4).variables["heads"]
+    assert after["iou_bias"] == 0
+    *classes, background = after["logits_bias"]
     nuscenes = np.array([0.36, 0.08, 0.02, 0.04, 0.015, 0.17, 0.015, 0.02, 0.09, 0.19])
     slopes = np.array(classes) - 0.4 * 0.75 * np.log(nuscenes)
     np.testing.assert_allclose(slopes, slopes.mean(), atol=1e-6)
@@ -127,87 +91,56 @@ def test_logits_are_adjusted_for_the_class_frequencies_of_nuscenes():
 
 
 @pytest.mark.slow
-def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path, monkeypatch):
-    package, scored = shipped
-
-    def scores(_):
-        written = json.loads((package / "hdl32e" / "checkpoint.json").read_text())
-        return {name: scored[name] for name in SCORES} | {"hash": written["hash"]}
-
-    monkeypatch.setattr(shipped_weights, "scores", scores)
-    run = load_checkpoint(tmp_path / "run/checkpoints/00000003")
-    other = jax.tree.map(lambda leaf: np.asarray(leaf) + np.float32(1), run.variables)
-    earlier = save_and_hash(tmp_path / "earlier", dataclasses.replace(run, variables=other))
-    args = shipped_weights.Args(name="hdl32e", work=tmp_path / "run", export=True, test_frames=2)
-    args = dataclasses.replace(args, average=tmp_path / "earlier", average_share=0.25)
-    shipped_weights.main(args)
-    both = (load_checkpoint(package / "hdl32e").variables, with_adjusted_logits(run, 0.75 * 0.5).variables)
-    for a, b in zip(*map(jax.tree.leaves, both), strict=True):
-        np.testing.assert_allclose(a, np.asarray(b, np.float32) + 0.25, rtol=1e-3, atol=1e-4)
-    record = json.loads((tmp_path / "results/hdl32e.json").read_text())
-    assert record["training"]["averaged_with"] == {"hash": earlier, "share": 0.25}
-    wrong = {
-        "--average-share: got 1.5": {"average_share": 1.5},
-        "--average: only for --export": {"export": False},
-        "--average-share: only with --average": {"average": None},
-        "--average: got another network": {"average": Path("hdl32e")},
-    }
-    for message, change_of in wrong.items():
-        with pytest.raises(ValueError, match=message):
-            shipped_weights.main(dataclasses.replace(args, **change_of))
-
-
-def save_and_hash(folder: Path, checkpoint: Checkpoint) -> str:
-    save_checkpoint(folder, checkpoint)
-    return json.loads((folder / "checkpoint.json").read_text())["hash"]
-
-
-@pytest.mark.slow
-def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
-    package, record = shipped
-    before = {file: file.read_bytes() for file in package.rglob("*") if file.is_file()}
+def test_weights_are_exported_averaged_scored_and_described(tmp_path, monkeypatch):
+    """A run of three steps, in a package and with results elsewhere."""
+    run, package, results = (tmp_path / name for name in ("run", "weights", "results"))
+    package.mkdir()
+    for module in (shipped_weights, model_card):
+        monkeypatch.setattr(module, "SHIPPED", package)
+    monkeypatch.setattr(shipped_weights, "RESULTS", results)
+    monkeypatch.setattr(shipped_weights, "_CURVE_FRAMES", 1)
     args = shipped_weights.Args(name="hdl32e", test_frames=2, out=tmp_path / "scores.json")
-    shipped_weights.main(args)
-    scored = json.loads(args.out.read_text())
-    assert {name: scored[name] for name in SCORES} == {name: record[name] for name in SCORES}
-    assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
-    for option in ({"export": True}, {"seed": 7}, {"warm_start": tmp_path}):
-        with pytest.raises(
-            ValueError, match=r"--(export|seed|warm-start): only for a training, expected its folder"
-        ):
-            shipped_weights.main(dataclasses.replace(args, **option))
-    # Scores alone are no training to go on from, nor to write a card of; nothing is overwritten.
-    results = tmp_path / "results"
+    with linear_network():
+        ours = untrained(CONFIG, TINY)
+        (run / "checkpoints").mkdir(parents=True)
+        save_checkpoint(run / "checkpoints" / "00000003", Checkpoint(CONFIG, TINY, ours, 3))
+        (run / "run.json").write_text(json.dumps({"seed": 4, "weights": None, "steps": 9}))
+        lines = ({"step": s, "loss/total": 1.0, "seconds": 2.0} for s in (1, 2, 3))
+        (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        others = jax.tree.map(lambda leaf: leaf + np.float32(1), ours)
+        save_checkpoint(tmp_path / "earlier", Checkpoint(CONFIG, TINY, others, 3))
+        exporting = dataclasses.replace(args, work=run, export=True, average=tmp_path / "earlier", out=None)
+        shipped_weights.main(exporting)
+        shipped_weights.main(args)
+        exported = load_checkpoint(package / "hdl32e").variables
+        hashes = [read_description(folder)["hash"] for folder in (package / "hdl32e", tmp_path / "earlier")]
+        record, scored = (json.loads(file.read_text()) for file in (results / "hdl32e.json", args.out))
+        assert {name: scored[name] for name in SCORES} == {name: record[name] for name in SCORES}
+        training = record["training"]
+        assert (training["steps"], training["steps_planned"], training["frames_seen"]) == (3, 9, 6)
+        assert (training["seconds_of_steps"], training["logit_adjustment"]) == (6, 0.5)
+        assert (record["hash"], training["averaged_with"]) == (hashes[0], {"hash": hashes[1], "share": 0.3})
+        for own, new in zip(*map(jax.tree.leaves, (ours, exported)), strict=True):
+            np.testing.assert_allclose(new, own + np.float32(0.3), rtol=1e-3, atol=1e-3)
+            np.testing.assert_array_equal(new, new.astype(np.float16).astype(np.float32))
+        # The card has only the figures of its weights.
+        card = (package / "hdl32e" / "README.md").read_text()
+        assert "Not measured yet" in card
+        assert f"mAP {record['mAP']:.3f}" in card
+        part = {"keyframes": 6, **scores_by_range(*random_frames(2), repeats=20)}
+        ap, boxes = part["all"]["AP"]["car"], part["all"]["truths"]["car"]
+        for weights in (hashes[0], "other"):
+            measured = {"checkpoint": {"hash": weights}, "scene-0523, odd": part}
+            (results / "transfer.json").write_text(json.dumps(measured))
+            text = model_card.write_card("hdl32e", results).read_text()
+            assert (f"| car | {ap:.3f} ({boxes}) |" in text) is (weights == hashes[0])
+    # Scores alone are no training to go on from, nor to write a card of.
     args.out.rename(results / "hdl32e.json")
-    (tmp_path / "run/run.json").write_text(json.dumps({"seed": 5, "weights": "hdl32e", "steps": 9}))
-    for again in (
-        lambda: shipped_weights.main(dataclasses.replace(args, work=tmp_path / "run", export=True)),
-        lambda: shipped_weights.main(dataclasses.replace(args, work=tmp_path / "new", warm_start=Path("hdl32e"))),
-        lambda: model_card.write_card("hdl32e", results),
-    ):
+    warm = dataclasses.replace(args, work=tmp_path / "new", warm_start=Path("hdl32e"))
+    for again in (lambda: shipped_weights.main(warm), lambda: model_card.write_card("hdl32e", results)):
         with pytest.raises(ValueError, match=r"hdl32e\.json: training: missing"):
             again()
-    assert not (tmp_path / "new").exists()
-    assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
-
-
-@pytest.mark.slow
-def test_a_card_has_only_the_figures_of_its_weights(shipped, tmp_path):
-    package, record = shipped
-    card = package / "hdl32e" / "README.md"
-    assert "Not measured yet" in card.read_text()
-    assert f"mAP {record['mAP']:.3f}" in card.read_text()
-    written = json.loads((package / "hdl32e" / "checkpoint.json").read_text())["hash"]
-    found, frames = random_frames(2)
-    part = {"keyframes": 6, **scores_by_range(found, frames, repeats=20)}
-    (tmp_path / "hdl32e.json").write_text(json.dumps(record))
-    for own in (True, False):
-        transfer = {"checkpoint": {"hash": written if own else "other"}, "scene-0523, odd": part}
-        (tmp_path / "transfer.json").write_text(json.dumps(transfer))
-        text = model_card.write_card("hdl32e", tmp_path).read_text()
-        car = part["all"]["AP"]["car"], part["all"]["truths"]["car"]
-        assert (f"| car | {car[0]:.3f} ({car[1]}) |" in text) is own
-    load_checkpoint(package / "hdl32e")  # the card is no part of the checkpoint
+    assert not warm.work.exists()
 
 
 @pytest.mark.slow

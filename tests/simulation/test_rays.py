@@ -51,10 +51,9 @@ def random_solids(rng, number):
     return solids
 
 
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("ground", [FAR_BELOW, HILLS], ids=["air", "hills"])
-def test_first_hits_match_ray_marching(seed, ground):
-    rng = np.random.default_rng(seed)
+def test_first_hits_match_ray_marching(ground):
+    rng = np.random.default_rng(0)
     solids, eye = random_solids(rng, 25), np.array([0.3, -0.4, 0.2])
     turn = Rotation.from_euler("XZ", [0.05, 1.0]).as_matrix()
     # The fan spans more than a full turn, and its lasers fire one after another.
@@ -84,19 +83,6 @@ def test_first_hits_match_ray_marching(seed, ground):
             on_kerb_face = edge < SLACK_M and abs(drop) < ground.kerb + SLACK_M
             assert abs(drop) < SLACK_M or on_kerb_face, drop
     assert met > 30
-
-
-def test_rays_hit_every_kind_and_the_nearest_solid():
-    solids = make_solids(BOX, [[6 + 4 * k, 0, 0] for k in range(4)], [1, 1, 1])
-    solids["kind"] = BOX, DRUM, BALL, WHEEL
-    straight = Fan(np.array([0.0]), 1, 0.0, 1e-3, np.zeros(1))
-    rng = np.random.default_rng(0)
-    for first in range(4):
-        hits = cast(straight, np.eye(3), np.zeros(3), solids[first:], FAR_BELOW, rng)
-        assert (hits.solid[0], hits.range_m[0]) == (0, pytest.approx(5 + 4 * first))
-        assert hits.cosine[0] == pytest.approx(1)
-    backwards = cast(straight, np.eye(3), np.zeros(3), solids[::-1], FAR_BELOW, rng)
-    assert backwards.solid[0] == 3
 
 
 @pytest.mark.parametrize("kind", [BOX, DRUM, BALL, WHEEL])

@@ -4,12 +4,11 @@ import numpy as np
 import oracles
 import pytest
 
-from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.projection import image_cells
-from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, SHORT_RANGE, TINY, WAYMO_TOP
+from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, SHORT_RANGE, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -23,7 +22,7 @@ def assert_equal(a, b):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
-@pytest.mark.parametrize("sensor", [TINY, NUSCENES_HDL32E, WAYMO_TOP, ARGOVERSE2], ids=lambda s: s.name)
+@pytest.mark.parametrize("sensor", [TINY, NUSCENES_HDL32E, ARGOVERSE2], ids=lambda s: s.name)
 def test_frames_are_reproducible_with_exact_counts_and_one_cell_per_ray(sensor):
     frame = make_frame(11, sensor)
     make_frame(12, sensor)
@@ -56,16 +55,13 @@ def test_frames_are_level_with_separate_objects_of_all_classes():
         ground = np.median(frame.points[frame.points[:, 2] < -1.5, 2])
         assert ((bottom > ground - 0.15) & (bottom < ground + 0.2)).all()  # on the road or the pavement
     counts = np.bincount(labels, minlength=10)
-    assert counts.min() >= 15, dict(zip(NUSCENES_CLASSES, counts, strict=True))
-    assert counts.max() < 4 * counts.min(), dict(zip(NUSCENES_CLASSES, counts, strict=True))
+    assert 15 <= counts.min() <= counts.max() < 4 * counts.min(), counts
     assert 0.1 < moving / len(labels) < 0.6
 
 
 def test_simulated_frames_annotate_near_objects_with_enough_points():
     near, complete = (SimulatedFrames(TINY, 6, 7, reach_m=8.0, min_points=least) for least in (5, 1))
     assert [near.name(index) for index in (0, 2)] == ["seed 7", "seed 9"]
-    with pytest.raises(IndexError):
-        near.frame(6)
     hidden = 0
     for i in range(6):
         frame, whole = near.frame(i), complete.frame(i)
@@ -100,28 +96,6 @@ def test_fused_frames_are_reproducible_and_annotated_by_the_current_sweep(fast_f
     laser = make_frame(0, ARGOVERSE2, reading=CloudReading(2, "none"))
     assert laser.points.shape[1] == 6
     assert set(np.unique(laser.points[:, 5])) <= set(range(64))
-
-
-def test_old_points_of_moving_objects_trail_by_velocity_times_lag(fast_frames):
-    """A moving box shifted back by velocity x lag contains more points than with a lag of 0.05 s more or less.
-
-    A static box contains more points than when it is shifted by half a metre.
-    """
-    trails, stays = np.zeros((10, 3), int), np.zeros((10, 3), int)
-    around = np.array([-1.0, 0, 1])
-    for frame in fast_frames:
-        for box in frame.boxes.astype(np.float64):
-            speed = np.hypot(box[7], box[8])
-            if 0 < speed < 6:
-                continue
-            for k, lag in enumerate(LAGS):
-                points = frame.points[frame.points[:, 4] == lag]
-                moves = -(lag + 0.05 * around)[:, None] * box[7:] if speed else around[:, None] * [0, 0.5]
-                moved = box + np.pad(moves, ((0, 0), (0, 7)))
-                (trails if speed else stays)[k] += count_inside(points, moved)
-    for counts in (trails, stays):
-        assert counts.min() > 500
-        np.testing.assert_array_equal(counts.argmax(axis=1), np.ones(10))
 
 
 def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep(fast_frames):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from experiments.cached import CachedFrames
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, sector
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, city_frames
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -72,13 +71,10 @@ def wavy_height(x, y):
     return 0.01 * x - 0.02 * y - 1.8 + wave(x) - CROWN_M * side**2 + 0.13 * (np.abs(y) >= 6)
 
 
-def test_the_height_of_uneven_ground_is_the_sum_of_its_parts():
-    x, y = default_rng(0).uniform(-150, 150, (2, 2000))
-    np.testing.assert_allclose(wavy_ground().height(x, y), wavy_height(x, y), atol=2e-4)
-
-
 def test_hits_on_uneven_ground_match_ray_marching():
     rng, eye = default_rng(1), np.array([0.3, -0.4, 0.2])
+    x, y = rng.uniform(-150, 150, (2, 2000))
+    np.testing.assert_allclose(wavy_ground().height(x, y), wavy_height(x, y), atol=2e-4)
     azimuth, falling = rng.uniform(-np.pi, np.pi, 400), np.radians(rng.uniform(-30, 3, 400))
     d = np.stack([np.cos(falling) * np.cos(azimuth), np.cos(falling) * np.sin(azimuth), np.sin(falling)])
     found, cosine = wavy_ground().first_hits(d.astype(np.float32), eye)
@@ -270,10 +266,9 @@ def test_surroundings_are_beside_their_street_and_off_both_carriageways(along, s
     assert len(found) > 200
     assert (found["owner"] == -1).all()
     low = found[(found["center"][:, 2] - found["half"][:, 2] < 2) & (found["density"] > 5)]
-    inside = np.abs(low["center"][:, 1]) < 6.5 if along == 0 else np.abs(low["center"][:, 0] - 30) < 5.5
-    assert not inside.any()
-    beside = low["center"][:, 1] if along == 0 else low["center"][:, 0] - 30
+    beside, half = (low["center"][:, 1], 7) if along == 0 else (low["center"][:, 0] - 30, 6)
     assert (np.sign(beside) == side).all()
+    assert (np.abs(beside) >= half - 0.5).all()
 
 
 @SIDES
@@ -306,7 +301,7 @@ def test_walls_and_long_buildings_line_the_street(along, side):
 
 
 def test_city_frames_vary_in_density():
-    frames = [city_frames(SENSOR, 10_000).frame(i) for i in range(12)]
+    frames = [city_frames(QUARTER, 10_000).frame(i) for i in range(8)]
     numbers = [len(frame.labels) for frame in frames]
     assert max(numbers) > 2 * min(numbers)
     shares = [frame.num_points.sum() / len(frame.points) for frame in frames]
@@ -321,13 +316,9 @@ def test_class_frequencies_match_the_shares():
     np.testing.assert_allclose(flat[0] / flat[2], np.sqrt(shares[0] / shares[2]))
 
 
-def test_streets_are_part_of_fingerprints_and_caches(tmp_path):
-    plain, city = SimulatedFrames(TINY, 3), SimulatedFrames(TINY, 3, streets=CITY)
-    finer = SimulatedFrames(TINY, 3, streets=dataclasses.replace(CITY, clutter=0.2))
-    assert len({frames.fingerprint() for frames in (plain, city, finer)}) == 3
-    CachedFrames(plain, tmp_path / "cache")
-    with pytest.raises(ValueError, match="streets"):
-        CachedFrames(city, tmp_path / "cache")
+def test_streets_are_part_of_fingerprints():
+    streets = PLAIN, CITY, dataclasses.replace(CITY, clutter=0.2)
+    assert len({SimulatedFrames(TINY, 3, streets=own).fingerprint() for own in streets}) == 3
 
 
 @pytest.mark.parametrize("streets", FRAMES)
