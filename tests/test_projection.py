@@ -14,10 +14,8 @@ from jax import export
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.projection import image_cells, priority_keys, project_points, remove_close, winners
 from fcos_lidar_jax.sensors import (
-    KITTI_HDL64E,
     NUSCENES_HDL32E,
     PRESETS,
-    TINY,
     WAYMO_TOP,
     Sensor,
     even_inclinations,
@@ -99,19 +97,6 @@ def test_cells_match_their_definition(sensor):
     np.testing.assert_allclose(inclination, np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])), atol=4e-7)
 
 
-def test_the_image_of_a_sector_is_part_of_the_image_of_the_turn():
-    """Uses points in the middle of their columns, so that the result does not depend on rounding."""
-    first, number = 150, 64
-    part = sector(TINY, np.pi - (first + number / 2) * TINY.column_rad, number)
-    row, column = np.divmod(np.arange(TINY.num_rows * TINY.num_columns), TINY.num_columns)
-    azimuth, inclination = np.pi - (column + 0.5) * TINY.column_rad, np.array(TINY.inclinations_rad)[row]
-    points = 3 * np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(inclination)], axis=1) + TINY.origin_m
-    np.testing.assert_array_equal(cells_of(points, TINY)[0], row * TINY.num_columns + column)
-    inside = (column >= first) & (column < first + number)
-    expected = np.where(inside, row * number + column - first, TINY.num_rows * number)
-    np.testing.assert_array_equal(cells_of(points, part)[0], expected)
-
-
 @pytest.mark.parametrize(("num_rounds", "prioritize_current"), [(1, True), (5, True), (5, False)])
 def test_rounds_keep_the_same_points_as_loops(num_rounds, prioritize_current):
     points = cloud(num_rounds)
@@ -178,23 +163,6 @@ def test_range_limits_are_exclusive():
     assert (cells_of(points, SMALL)[0] < SMALL.num_rows * SMALL.num_columns).tolist() == [False, True] * 6
 
 
-@pytest.mark.parametrize("sensor", [NUSCENES_HDL32E, KITTI_HDL64E], ids=lambda s: s.name)
-def test_the_field_of_view_ends_half_a_row_beyond_the_outer_beams(sensor):
-    table = np.array(sensor.inclinations_rad)
-    above, below = (table[0] - table[1]) / 2, (table[-2] - table[-1]) / 2
-    phi = [table[0] + 0.99 * above, table[0] + 1.01 * above, table[-1] - 0.99 * below, table[-1] - 1.01 * below]
-    points = np.array([[0, 8 * np.cos(a), 8 * np.sin(a), 0, 0] for a in phi], np.float32)
-    outside = sensor.num_rows
-    assert (cells_of(points, sensor)[0] // sensor.num_columns).tolist() == [0, outside, outside - 1, outside]
-
-
-def test_points_between_unevenly_spaced_beams_go_to_the_nearest_beam():
-    uneven = Sensor("uneven", (0.10, 0.08, -0.10), 8)
-    phi = [0.0901, 0.0899, -0.0099, -0.0101]  # around the midpoints 0.09 and -0.01
-    points = np.array([[0, 8 * np.cos(a), 8 * np.sin(a), 0, 0] for a in phi], np.float32)
-    assert (cells_of(points, uneven)[0] // 8).tolist() == [0, 1, 1, 2]
-
-
 def test_only_points_with_zero_time_lag_are_current():
     range_m, lag = jnp.array([5.0, 9.0, 6.0]), jnp.array([1e-6, -0.0, 0.4])
     for prioritize, order in ((True, [1, 0, 2]), (False, [0, 2, 1])):
@@ -231,9 +199,6 @@ BATCHES = r"points, valid: got shapes .* use jax\.vmap for batches"
         (CLOUD, MASK, LASER, 1, "points: got 5 columns, expected 6 for sensor 'laser'"),
         (CLOUD[None], MASK[None], SMALL, 1, BATCHES),
         (CLOUD, MASK[1:], SMALL, 1, BATCHES),
-        (CLOUD, MASK, "tiny", 1, r"sensor: got 'tiny', expected a Sensor, such as load_sensor\(NAME\)"),
-        (CLOUD.tolist(), MASK, SMALL, 1, "points: got 'list', expected an array"),
-        (CLOUD, MASK.tolist(), SMALL, 1, "valid: got 'list', expected an array"),
     ],
 )
 def test_wrong_arguments_are_rejected(points, valid, sensor, num_rounds, message):
