@@ -209,8 +209,8 @@ def project_points(
         the image; ``point_index`` refers to rows of ``points``.
 
     Raises:
-        ValueError: at trace time, for arguments of other types or shapes, if ``points`` has fewer columns than the
-            sensor needs, or without a round.
+        ValueError: at trace time, for arrays of other shapes, if ``points`` has fewer columns than the sensor
+            needs, or without a round.
 
     >>> import fcos_lidar_jax as fcos
     >>> sensor = fcos.load_sensor("short_range")  # a preset, or a file that describes your LiDAR
@@ -222,9 +222,6 @@ def project_points(
     >>> compiled(cloud, np.ones(2, bool), sensor, num_rounds=2).features.shape
     (32, 128, 9, 2)
     """
-    check(isinstance(sensor, Sensor), "sensor", sensor, "a Sensor, such as load_sensor(NAME)")
-    for name, array in (("points", points), ("valid", valid)):
-        check(hasattr(array, "ndim"), name, type(array).__name__, "an array")
     if points.ndim != 2 or valid.shape != points.shape[:1]:
         got = f"got shapes {points.shape} and {valid.shape}"
         raise ValueError(f"points, valid: {got}, expected (n, c) and (n,); use jax.vmap for batches")

@@ -35,11 +35,11 @@ def run_jobs(work: Callable[[Any, Any], Any], shared: Any, jobs: Sequence[Any], 
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     try:
         yield from (future.result() for future in as_completed(futures))
-    except BrokenProcessPool:
-        raise OSError("a worker process died, possibly out of memory: try fewer workers") from None
-    except BaseException:
+    except BaseException as error:
         for process in set(multiprocessing.active_children()) - others:
             process.kill()
+        if isinstance(error, BrokenProcessPool):
+            raise OSError("a worker process died, possibly out of memory: try fewer workers") from None
         raise
     finally:
         pool.shutdown(cancel_futures=True)

@@ -9,7 +9,7 @@ import oracles
 import pytest
 from jax import export
 
-from fcos_lidar_jax.assignment import assign, cheapest, dynamic_k, owners
+from fcos_lidar_jax.assignment import assign, owners
 
 
 def f32(x):
@@ -27,18 +27,16 @@ FORMS = pytest.mark.parametrize("form", ["loop", "reduction"])
 
 
 @FORMS
-@pytest.mark.parametrize("num_boxes", [1, 40, 256])
+@pytest.mark.parametrize("num_boxes", [1, 40])
 def test_owners_of_overlapping_boxes_match_loops(num_boxes, form):
     rng = np.random.default_rng(num_boxes)
     boxes = oracles.random_boxes(rng, num_boxes, 4.0).astype(np.float32)
-    points = rng.normal(0, 4, (300, 3)).astype(np.float32) * [1, 1, 0.3]
-    points = points.astype(np.float32)
+    points = (rng.normal(0, 4, (300, 3)) * [1, 1, 0.3]).astype(np.float32)
     present, valid = rng.random(300) < 0.9, rng.random(num_boxes) < 0.8
     actual = np.asarray(owners(points, present, boxes, valid, form=form))
     expected = [oracles.owner(p, boxes, valid) if here else -1 for p, here in zip(points, present, strict=True)]
     np.testing.assert_array_equal(actual, expected)
-    inside = [sum(oracles.inside(p, b) for b in boxes) for p in points]
-    assert num_boxes == 1 or max(inside) >= 2
+    assert num_boxes == 1 or max(sum(oracles.inside(p, b) for b in boxes) for p in points) >= 2
 
 
 @FORMS
@@ -67,8 +65,8 @@ def test_only_cpu_programs_loop_over_boxes_and_in_searches():
         assert program.mlir_module().count("stablehlo.while") == loops
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("num_boxes", [1, 20, 256])
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("num_boxes", [1, 100])
 def test_assignment_matches_the_matrix_form(seed, num_boxes):
     rng = np.random.default_rng(seed)
     owner = rng.integers(-1, num_boxes, 2000).astype(np.int32)
@@ -80,19 +78,6 @@ def test_assignment_matches_the_matrix_form(seed, num_boxes):
     targets = compute(i32(owner), f32(cost), f32(iou), num_boxes=num_boxes)
     np.testing.assert_array_equal(targets.num_positive, ks)
     np.testing.assert_array_equal(targets.positive, expected)
-
-
-@pytest.mark.parametrize(
-    ("ious", "k"),
-    [([1.0, 0.5], 2), ([1, 1, 0.5], 3), ([0.25] * 5, 1), ([0.0] * 4, 1), ([1.0] * 25, 20), ([0.9], 1)],
-)
-def test_k_rounds_half_up_is_at_least_one_and_at_most_the_candidates(ious, k):
-    owner = [0] * len(ious) + [-1] * 3
-    assert dynamic_k(i32(owner), f32([*ious, 1, 1, 1]), num_boxes=1, top_q=20).tolist() == [k]
-
-
-def test_the_lower_index_wins_among_equal_costs():
-    assert cheapest(i32([0, 0, 0, 0]), f32([1, 1, 1, 1]), i32([2])).tolist() == [True, True, False, False]
 
 
 def test_without_candidates_and_with_one_candidate():

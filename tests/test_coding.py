@@ -42,22 +42,6 @@ def test_ray_axes_rotate_offset_and_velocity():
     np.testing.assert_array_equal(actual[:, 2:8], unchanged)
 
 
-def test_values_along_ray_axes_are_the_same_all_around_the_sensor():
-    boxes, points, azimuth = samples()
-    boxes[:, 7:] += 5
-    turned, angle = [a.copy() for a in (boxes, points)], 1.2
-    matrix = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    for vectors in (turned[0][:, :2], turned[0][:, 7:], turned[1][:, :2]):
-        vectors[:] = vectors @ matrix.T
-    turned[0][:, 6] += angle
-    here, there = (
-        {axes: np.asarray(jitted(encode)(*given, axes=axes)) for axes in ("lidar", "ray")}
-        for given in ((boxes, points, azimuth), (*turned, azimuth + np.float32(angle)))
-    )
-    np.testing.assert_allclose(there["ray"], here["ray"], atol=1e-4)
-    assert np.abs(there["lidar"] - here["lidar"]).max() > 1
-
-
 @both_axes
 def test_decoding_inverts_encoding(axes):
     boxes, points, azimuth = map(jnp.asarray, samples())
@@ -99,11 +83,9 @@ def test_degenerate_predictions_decode_to_finite_boxes_with_finite_gradients(axe
 
 
 @both_axes
-def test_results_are_the_same_under_jit_and_vmap(axes):
+def test_results_are_the_same_under_vmap(axes):
     boxes, points, azimuth = map(jnp.asarray, samples())
     numbers = jitted(encode)(boxes, points, azimuth, axes=axes)
     for function, args in ((encode, (boxes, points, azimuth)), (decode, (numbers, points, azimuth))):
-        plain = function(*args, axes=axes)
-        np.testing.assert_allclose(jitted(function)(*args, axes=axes), plain, atol=1e-5)
-        of_one = functools.partial(function, axes=axes)
-        np.testing.assert_allclose(jax.jit(jax.vmap(of_one))(*args), plain, atol=1e-5)
+        of_one = jax.jit(jax.vmap(functools.partial(function, axes=axes)))
+        np.testing.assert_allclose(of_one(*args), jitted(function)(*args, axes=axes), atol=1e-5)

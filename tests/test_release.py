@@ -64,6 +64,7 @@ def followed(site: Path) -> subprocess.CompletedProcess:
 
 
 def test_links_inside_the_site_are_followed(tmp_path):
+    assert followed(tmp_path).returncode == 1  # no pages
     (tmp_path / "api").mkdir()
     (tmp_path / "index.html").write_text(
         '<h1 id="one"></h1><a href="#one"></a><a href="api/core.html#iou%20of"></a><img src="a.png">'
@@ -75,15 +76,11 @@ def test_links_inside_the_site_are_followed(tmp_path):
     assert (run.returncode, run.stdout) == (0, f"{tmp_path.name}: 2 pages, 4 links inside, 0 broken\n")
 
 
-@pytest.mark.parametrize("link", ["gone.html", "index.html#two", "#two", "../outside.html", "gone.png"])
-def test_a_link_that_leads_nowhere_is_named(link, tmp_path):
+def test_links_that_lead_nowhere_are_named(tmp_path):
+    links = ["gone.html", "index.html#two", "#two", "../outside.html", "gone.png"]
     (tmp_path / "site").mkdir()
     (tmp_path / "outside.html").touch()
-    (tmp_path / "site" / "index.html").write_text(f'<h1 id="one"></h1><a href="{link}"></a>')
+    (tmp_path / "site" / "index.html").write_text("".join(f'<a href="{link}"></a>' for link in links))
     run = followed(tmp_path / "site")
     assert run.returncode == 1
-    assert run.stdout.startswith(f"index.html: {link}: leads nowhere\n")
-
-
-def test_a_site_without_pages_is_refused(tmp_path):
-    assert followed(tmp_path).returncode == 1
+    assert run.stdout.splitlines()[:5] == sorted(f"index.html: {link}: leads nowhere" for link in links)

@@ -1,22 +1,25 @@
-"""Arrays that do not fit each other are refused by functions whose annotations nobody checks."""
+"""Arrays that do not fit are refused by functions whose annotations nobody checks."""
 
 import inspect
+import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fcos_lidar_jax import assignment, losses, nms
+from fcos_lidar_jax import assignment, geometry, iou, losses, nms
+from fcos_lidar_jax.types import check_columns
 
 
 def z(*shape, dtype=np.float32):
     return np.zeros(shape, dtype)
 
 
-MASK, ONE, BOXES_MASK = z(3, dtype=bool), z(1, dtype=bool), z(2, dtype=bool)
-KEPT = z(2, dtype=np.int32), BOXES_MASK
+MASK, ONE, TWO = z(3, dtype=bool), z(1, dtype=bool), z(2, dtype=bool)
+KEPT = jnp.zeros(2, jnp.int32), jnp.zeros(2, bool)
 LABELS = {"labels": z(1, dtype=np.int32)}
 LIMITS = {"iou_threshold": 0.5, "max_outputs": 2}
-CASES = [
+LENGTHS = [
     (losses.cross_entropy, (z(3, 2), z(1, dtype=np.int32)), {}, "labels: got shape (1,), expected (3,)"),
     (losses.classification_loss, (z(3, 2), z(3, dtype=np.int32), ONE), {}, "mask: got shape (1,), expected (3,)"),
     (
@@ -27,11 +30,10 @@ CASES = [
     ),
     (losses.iou_loss, (z(3, 8), z(3, 8), ONE), {}, "mask: got shape (1,), expected (3,)"),
     (losses.iou_prediction_loss, (z(3, 1), z(3), MASK), {}, "logits: got shape (3, 1), expected (3,)"),
-    (losses.iou_prediction_loss, (z(3), z(3), ONE), {}, "mask: got shape (1,), expected (3,)"),
     (nms.rotated_nms, (z(2, 7), z(3), MASK), LIMITS, "scores: got shape (3,), expected (2,)"),
-    (nms.rotated_nms, (z(2, 7), z(2), BOXES_MASK), LIMITS | LABELS, "labels: got shape (1,), expected (2,)"),
+    (nms.rotated_nms, (z(2, 7), z(2), TWO), LIMITS | LABELS, "labels: got shape (1,), expected (2,)"),
     (nms.merge_boxes, (z(2, 7), z(2), ONE, *KEPT), {"iou_threshold": 0.5}, "valid: got shape (1,), expected (2,)"),
-    (assignment.owners, (z(3, 3), ONE, z(2, 7), BOXES_MASK), {}, "present: got shape (1,), expected (3,)"),
+    (assignment.owners, (z(3, 3), ONE, z(2, 7), TWO), {}, "present: got shape (1,), expected (3,)"),
     (assignment.owners, (z(3, 3), MASK, z(2, 7), ONE), {}, "box_valid: got shape (1,), expected (2,)"),
     (
         assignment.assign,
@@ -40,11 +42,28 @@ CASES = [
         "classification_cost: got shape (1,), expected (3,)",
     ),
 ]
+BOX = "expected columns x, y, z, l, w, h, yaw, ..."
+ORIENTED = "expected columns x, y, z, l, w, h, cos yaw, sin yaw"
+LAYOUTS = [
+    (geometry.points_in_box, (z(1, 3), z(1, 5)), {}, f"boxes: got shape (1, 5), {BOX}"),
+    (iou.rotated_iou_bev, (z(1, 5), z(1, 5)), {}, f"boxes: got shape (1, 5), {BOX}"),
+    (iou.rotated_iou_3d, (z(1, 7), z(1, 5)), {}, f"boxes: got shape (1, 5), {BOX}"),
+    (nms.rotated_nms, (z(2, 5), z(2), TWO), LIMITS, f"boxes: got shape (2, 5), {BOX}"),
+    (nms.merge_boxes, (z(2, 5), z(2), TWO, *KEPT), {"iou_threshold": 0.5}, f"boxes: got shape (2, 5), {BOX}"),
+    (assignment.owners, (z(3, 3), MASK, z(2, 5), TWO), {"form": "loop"}, f"boxes: got shape (5,), {BOX}"),
+    (losses.iou_loss, (z(1, 7), z(1, 8), ONE), {}, f"prediction: got shape (1, 7), {ORIENTED}"),
+    (losses.iou_loss, (z(1, 8), z(1, 9), ONE), {}, f"target: got shape (1, 9), {ORIENTED}"),
+    (check_columns, ("value", z(2, 9), "x, y, z"), {}, "value: got shape (2, 9), expected columns x, y, z"),
+    (check_columns, ("box", z(), "x, ..."), {}, "box: got shape (), expected columns x, ..."),
+]
 
 
-@pytest.mark.parametrize(("function", "args", "options", "message"), CASES)
-def test_other_lengths_are_refused_instead_of_broadcast_or_clamped(function, args, options, message):
+@pytest.mark.parametrize(("function", "args", "options", "message"), LENGTHS + LAYOUTS)
+def test_other_shapes_are_refused_instead_of_broadcast_or_clamped(function, args, options, message):
     unchecked = inspect.unwrap(function)  # without the shapes that the tests check in signatures
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
         unchecked(*args, **options)
-    assert str(caught.value) == message
+
+
+def test_columns_may_follow_where_the_layout_says_so():
+    check_columns("box", z(2, 9), "x, y, z, ...")

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.inference.onnx_graph import cpu_package, network_graph
@@ -35,11 +34,9 @@ class OpenVinoDetector(TrainedDetector):
     def fingerprint(self) -> str:
         return f"{super().fingerprint} openvino {cpu_package('openvino').__version__} {self.precision}"
 
-    def with_inference(self, **fields: Any) -> TrainedDetector:
-        """See :meth:`TrainedDetector.with_inference`; refuses flips."""
-        detector = super().with_inference(**fields)
-        _check_flips(detector.config)
-        return detector
+    def __post_init__(self) -> None:
+        if (flips := self.config.inference.flips) != "none":
+            raise ValueError(f"backend openvino: found inference.flips {flips}, expected none")
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         """See :meth:`CloudDetector.program`; clouds of a batch run one by one, with identical results."""
@@ -64,11 +61,6 @@ def _jitted_stages(detector: Detector) -> tuple[Callable[..., Any], ...]:
     return jax.jit(stages.prepare), jax.jit(stages.postprocess), jax.jit(stages.refine)
 
 
-def _check_flips(config: Config) -> None:
-    if config.inference.flips != "none":
-        raise ValueError(f"backend openvino: found inference.flips {config.inference.flips}, expected none")
-
-
 def processor_precision() -> Precision:
     """bfloat16 if the processor supports it, else float32."""
     capabilities = cpu_package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
@@ -83,7 +75,6 @@ def with_openvino(detector: TrainedDetector, *, precision: Precision | None = No
     if jax.default_backend() != "cpu" or jax.process_count() > 1:
         found = f"{jax.process_count()} processes on {jax.default_backend()}"
         raise ValueError(f"backend openvino: found {found}, expected one on cpu")
-    _check_flips(detector.config)
     graph = network_graph(detector)
     precision = precision or processor_precision()
     openvino = cpu_package("openvino")

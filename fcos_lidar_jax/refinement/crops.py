@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Float32
 
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.refinement.types import Crops
-from fcos_lidar_jax.types import BOX, check_columns, check_rows
 
 _WORD = 32  # Bits of a word.
 _ROW_BITS = 24  # Bits of the row of a point; the remaining 40 of a 64-bit word are its hash.
@@ -43,10 +42,7 @@ def crop_points(
     >>> crops.points[0, 0, :3].round().tolist(), crops.count.tolist()
     ([1.0, -0.0, 0.0], [1])
     """
-    check_columns("points", points, "x, y, z, intensity, time lag, ...")
-    check_columns("boxes", boxes, BOX)
     number = points.shape[0]  # which may be symbolic in an exported program
-    check_rows(number, valid=valid)
     num_words = number // _WORD + 1
     padding = num_words * _WORD - number
     # The barrier isolates the arithmetic, so that points round identically in every program that contains it.

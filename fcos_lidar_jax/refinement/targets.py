@@ -5,7 +5,6 @@ from jaxtyping import Array, Bool, Float32, Int32
 
 from fcos_lidar_jax.geometry import atan2, safe_norm, wrap_angle
 from fcos_lidar_jax.refinement.types import RefinementTargets
-from fcos_lidar_jax.types import check_rows
 
 _FAR_M = 1e6  # Cost of a pair that is too far apart.
 _MIN_SIZE_M = 0.05
@@ -44,8 +43,6 @@ def match_boxes(
     >>> match_boxes(boxes, labels, valid, *truth, num_classes=2, radius_range_m=(1.0, 2.0)).label.tolist()
     [0, 2, 2]
     """
-    check_rows(len(boxes), labels=labels, valid=valid)
-    check_rows(len(true_boxes), true_labels=true_labels, true_valid=true_valid)
     boxes, true_boxes = jnp.asarray(boxes, jnp.float32), jnp.asarray(true_boxes, jnp.float32)
     if not len(true_boxes):  # one object that does not exist, because none cannot be gathered
         true_boxes, true_labels = jnp.ones((1, 9), jnp.float32), jnp.zeros(1, jnp.int32)

@@ -47,11 +47,6 @@ def test_a_file_says_by_its_fields_which_detector_it_is_of():
         config_from_json({**record, "pillars": {"pillar_m": 0.2}}, "run")
 
 
-def test_groups_of_the_classes():
-    assert CENTERPOINT_PILLARS.class_groups[CENTERPOINT_PILLARS.classes.index("barrier")] == 3
-    assert CenterPointConfig(classes=("a", "b")).class_groups == (0, 0)
-
-
 def test_the_fields_that_detectors_share_go_from_one_configuration_to_another():
     peer = CenterPointConfig.of(NUSCENES, max_points=9)
     assert (peer.max_points, peer.optimizer, peer.pillars) == (9, NUSCENES.optimizer, PillarConfig())

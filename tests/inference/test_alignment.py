@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusal import refused
+from tiny_run import SENSOR
 
-import fcos_lidar_jax as fcos
 from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.inference.alignment import Alignment, align
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E, TINY, VLP16
-from fcos_lidar_jax.simulation.frame_set import unseen_frames
+from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.types import Detections
 
 
@@ -68,49 +68,44 @@ def test_files_of_several_sensors_and_wrong_scales_are_refused(tmp_path):
         align(NUSCENES_HDL32E, intensity_scale=-1.0)
 
 
-def test_a_note_says_if_nothing_declares_the_heading_of_files(capsys):
-    options = "(--data-sensor, --yaw-deg)"
-    told = f"note: the heading of the clouds is not declared {options}: the detector expects y ahead\n"
-    files = [Path("a.npy")]
-    for aligned, expected in (
-        (align(TINY, paths=files), told),
-        (align(TINY, TINY, paths=files), ""),
-        (align(TINY, paths=files, yaw_rad=0.0), ""),
-        (align(VLP16, paths=files), ""),
+UNKNOWN = dataclasses.replace(TINY, forward_rad=None)
+FILES = [Path("a.npy")]
+NOT_DECLARED = (
+    "note: the heading of the clouds is not declared (--data-sensor, --yaw-deg): the detector expects y ahead\n"
+)
+NOT_ROTATED = (
+    "note: clouds are not rotated, since the heading of {} is unknown (forward_rad){}; --yaw-deg rotates them\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("aligned", "expected"),
+    [
+        (align(TINY, paths=FILES), NOT_DECLARED),
+        (align(TINY, TINY, paths=FILES), ""),
+        (align(TINY, paths=FILES, yaw_rad=0.0), ""),
+        (align(VLP16, paths=FILES), ""),
         (align(NUSCENES_HDL32E, paths=[Path("LIDAR_TOP/a.pcd.bin")]), ""),
         (align(NUSCENES_HDL32E, paths=[Path("n015__LIDAR_TOP__7.pcd.bin")]), ""),
-    ):
-        aligned.tell_notes()
-        assert capsys.readouterr().err == expected
-
-
-def test_a_note_says_if_only_one_heading_is_known(capsys):
-    why = "since the heading of their sensor is unknown (forward_rad): the detector expects y ahead"
-    unknown = dataclasses.replace(TINY, forward_rad=None)
-    for aligned, expected in (
-        (align(TINY, unknown), f"note: clouds are not rotated, {why}; --yaw-deg rotates them\n"),
-        (Alignment(unknown, TINY, yaw_rad=0.0), ""),
-        (align(unknown), ""),
+        (align(TINY, UNKNOWN), NOT_ROTATED.format("their sensor", ": the detector expects y ahead")),
+        (Alignment(TINY, UNKNOWN), NOT_ROTATED.format("the detector's sensor", "")),
+        (Alignment(UNKNOWN, TINY, yaw_rad=0.0), ""),
+        (align(UNKNOWN), ""),
         (Alignment(TINY, TINY), ""),
-        (
-            Alignment(TINY, unknown),
-            "note: clouds are not rotated, since the heading of the detector's sensor is unknown (forward_rad); "
-            "--yaw-deg rotates them\n",
-        ),
-    ):
-        aligned.tell_notes()
-        assert capsys.readouterr().err == expected
+    ],
+)
+def test_a_note_says_if_a_heading_is_unknown(aligned, expected, capsys):
+    aligned.tell_notes()
+    assert capsys.readouterr().err == expected
 
 
-@pytest.mark.slow
-def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(capsys):
-    detector = fcos.load_detector("quickstart")
-    frame = unseen_frames(detector.sensor, 1).frame(0)
+def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(detector, capsys):
+    frame = make_frame(0, SENSOR)
     points = np.column_stack([frame.points[:, 1], -frame.points[:, 0], frame.points[:, 2:]])
-    ahead = dataclasses.replace(detector.sensor, forward_rad=0.0)
+    ahead = dataclasses.replace(SENSOR, forward_rad=0.0)
     [expected], [found] = (
         list(predict(detector, InMemoryFrames((dataclasses.replace(frame, points=p),), sensor, detector.classes)))
-        for p, sensor in ((frame.points, detector.sensor), (points, ahead))
+        for p, sensor in ((frame.points, SENSOR), (points, ahead))
     )
     assert capsys.readouterr().err.count("clouds rotated by 90 degrees") == 1
     valid = np.asarray(expected.detections.valid)

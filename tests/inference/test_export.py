@@ -1,6 +1,5 @@
 """Exported detectors are bit-identical to their checkpoint, deterministic, and free of paths of this machine."""
 
-import hashlib
 import json
 import re
 import sys
@@ -10,41 +9,50 @@ import jax
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, run_python
-from tiny_run import TINY_REFINED as TINY_CONFIG
-from tiny_run import bits, untrained
+from linear_network import linear_network
+from refusal import refused
+from tiny_run import CONFIG, REFINED, SENSOR, bits, untrained
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.data.cloud_policy import make_cloud
+from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.inference.export import PLATFORMS, export_detector, load_exported
-from fcos_lidar_jax.sensors import TINY, sensor_from_json
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.sensors import sensor_from_json
 from fcos_lidar_jax.simulation.frames import make_frame
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-VARIABLES = untrained(TINY_CONFIG, TINY)
+VARIABLES = untrained(CONFIG, SENSOR)
+BAD_ROWS = [5, 6, 7, 11, 12]
+
+
+def raw_cloud():
+    """A cloud with points on the ego vehicle and unusable points, in ``BAD_ROWS``."""
+    points = make_frame(3, SENSOR).points
+    points[5:8, :2] = SENSOR.origin_m[:2]
+    points[11, 1], points[12, 3] = np.nan, 1e30
+    return points
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """Folder of a checkpoint, an exported detector, and a cloud with points that must be ignored."""
+    """Folder of a checkpoint, an exported detector, and a raw cloud."""
     folder = tmp_path_factory.mktemp("export")
-    save_checkpoint(folder / "checkpoint", Checkpoint(TINY_CONFIG, TINY, VARIABLES, 7))
+    save_checkpoint(folder / "checkpoint", Checkpoint(CONFIG, SENSOR, VARIABLES, 7))
     command("export --checkpoint", folder / "checkpoint", "--out", folder / "detector.fcos")
-    points = make_frame(3, TINY).points
-    points[5:8, :2] = TINY.origin_m[:2]  # on the ego vehicle
-    points[11, 1], points[12, 3] = np.nan, 1e30
-    np.save(folder / "cloud.npy", points)
+    np.save(folder / "cloud.npy", raw_cloud())
     return folder
 
 
 @pytest.mark.optimised
 def test_boxes_are_bit_identical_to_the_checkpoint(home):
     trained, exported = (fcos.load_detector(home / name) for name in ("checkpoint", "detector.fcos"))
-    clouds = [*(make_frame(seed, TINY).points for seed in range(3)), np.load(home / "cloud.npy")]
-    for points in clouds:
-        cloud = make_cloud(points, TINY_CONFIG, sensor=TINY)
+    for points in (make_frame(0, SENSOR).points, raw_cloud()):
+        cloud = make_cloud(points, CONFIG, sensor=SENSOR)
         found = exported.detect(cloud)
         assert found.valid.any()
         assert bits(found) == bits(trained.detect(cloud))
@@ -63,82 +71,6 @@ def test_detect_accepts_an_exported_detector_with_its_batch_size(home, tmp_path,
 
 
 @pytest.mark.optimised
-def test_the_program_cleans_raw_clouds(home):
-    trained, points = fcos.load_detector(home / "checkpoint"), np.load(home / "cloud.npy")
-    exported = load_exported(home / "detector.fcos").exported
-    padded = np.full((1, TINY_CONFIG.max_points, 5), np.nan, np.float32)
-    padded[0, : len(points)] = points
-    valid = np.arange(TINY_CONFIG.max_points)[None] < len(points)
-    program = jax.jit(exported.call)
-    found = program(padded, valid, True)
-    expected = trained.detect(make_cloud(points, TINY_CONFIG, sensor=TINY))
-    assert {name: bits(leaf[0]) for name, leaf in found.items()} == {
-        name: bits(getattr(expected, name)) for name in found
-    }
-    kept = program(padded, valid, False)
-    assert bits(kept) != bits(found)
-    close = (np.abs(points[:, :2] - TINY.origin_m[:2]) < TINY_CONFIG.projection.close_m).all(axis=1)
-    points[close] += np.float32(1000)  # beyond the limits, and therefore dropped
-    padded[0, : len(points)] = points
-    assert bits(program(padded, valid, False)["boxes"]) == bits(found["boxes"])
-
-
-def test_an_export_for_any_number_of_points_and_clouds(home, tmp_path, capsys):
-    out = tmp_path / "any.fcos"
-    command("export --points any --batch any --checkpoint", home / "checkpoint", "--out", out)
-    printed = json.loads(capsys.readouterr().out)
-    assert (printed["num_points"], printed["batch"], printed["bytes"]) == ("any", "any", out.stat().st_size)
-    trained, exported = fcos.load_detector(home / "checkpoint"), load_exported(out)
-    clouds = [make_frame(seed, TINY).points for seed in range(2)]
-    length = max(map(len, clouds)) + 3
-    points = np.stack([np.pad(cloud, ((0, length - len(cloud)), (0, 0))) for cloud in clouds])
-    valid = np.stack([np.arange(length) < len(cloud) for cloud in clouds])
-    found = jax.jit(exported.exported.call)(points, valid, True)
-    for scores, cloud in zip(found["scores"], clouds, strict=True):
-        expected = trained(cloud).scores
-        np.testing.assert_allclose(scores[: len(expected)], expected, atol=1e-4)
-        assert not scores[len(expected) :].any()
-
-
-def test_exports_are_deterministic_and_contain_no_path_of_this_machine(home):
-    content = (home / "detector.fcos").read_bytes()
-    jax.clear_caches()
-    assert export_detector(fcos.load_detector(home / "checkpoint")) == content  # type: ignore[arg-type]
-    for trace in (str(ROOT), str(home), sys.prefix, str(Path.home()), ".py", "site-packages"):
-        assert trace.encode() not in content, trace
-
-
-def test_the_record_describes_the_detector(home):
-    first, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
-    record = json.loads(line)
-    assert record == load_exported(home / "detector.fcos").record
-    assert record["classes"] == list(TINY_CONFIG.classes)
-    assert sensor_from_json(record["sensor"], "") == TINY
-    assert record["platforms"] == list(PLATFORMS) == ["cpu", "cuda", "rocm", "tpu"]
-    assert f"jax {jax.__version__}" in record["written_by"]
-    weights = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(VARIABLES))
-    assert record["weights"]["blake2b"] == hashlib.blake2b(weights, digest_size=16).hexdigest()
-    assert record["program"] == {
-        "bytes": len(program),
-        "blake2b": hashlib.blake2b(program, digest_size=16).hexdigest(),
-    }
-    content = hashlib.blake2b(line + b"\n" + program, digest_size=16).hexdigest()
-    assert first.decode() == f"fcos-lidar-detector 1 {content}"
-
-
-def test_a_file_of_an_older_version_is_read(home, tmp_path):
-    _, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
-    record = json.loads(line)
-    later = ("model", "regression_axes"), ("model", "remat"), ("loss", "quality"), ("inference", "flips")
-    for section, name in later:
-        del record["config"][section][name]
-    content = json.dumps(record).encode() + b"\n" + program
-    first = f"fcos-lidar-detector 1 {hashlib.blake2b(content, digest_size=16).hexdigest()}\n".encode()
-    (tmp_path / "older.fcos").write_bytes(first + content)
-    assert load_exported(tmp_path / "older.fcos").config == load_exported(home / "detector.fcos").config
-
-
-@pytest.mark.optimised
 def test_the_documented_code_runs_without_this_package(home):
     code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), re.DOTALL)
     hide = "import os, sys; sys.modules['fcos_lidar_jax'] = sys.modules['flax'] = None"
@@ -151,53 +83,125 @@ def test_the_documented_code_runs_without_this_package(home):
     assert [np.float32(line.split()[1]) for line in lines] == list(found.scores)
 
 
-DAMAGE = {
-    "foreign": (lambda content: b"PK\x03\x04" + content, "found a file, expected a checkpoint folder or a file"),
-    "other format": (
-        lambda content: content.replace(b"r 1", b"r 2", 1),
-        "format: got '2', expected 1",
-    ),
-    "other checksum": (lambda content: content[:30] + b"f" * 4 + content[34:], "checksum .*: damaged"),
-    "record": (lambda content: content.replace(b'"car"', b'"cat"', 1), "checksum .*: damaged"),
-    "program": (lambda content: content[:-9] + bytes([content[-9] ^ 1]) + content[-8:], "checksum .*: damaged"),
-    "cut": (lambda content: content[:-100], "checksum .*: damaged"),
-    "empty": (lambda content: b"", "found a file, expected a checkpoint folder or a file"),
-}
+def test_the_record_describes_the_detector(home):
+    first, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
+    record = json.loads(line)
+    assert record == load_exported(home / "detector.fcos").record
+    assert record["classes"] == list(CONFIG.classes)
+    assert sensor_from_json(record["sensor"], "") == SENSOR
+    assert record["platforms"] == list(PLATFORMS) == ["cpu", "cuda", "rocm", "tpu"]
+    assert f"jax {jax.__version__}" in record["written_by"]
+    weights = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(VARIABLES))
+    assert record["weights"]["blake2b"] == checksum(weights)
+    assert record["program"] == {"bytes": len(program), "blake2b": checksum(program)}
+    assert first.decode() == "fcos-lidar-detector 1 " + checksum(line + b"\n" + program)
 
 
-@pytest.mark.parametrize("name", DAMAGE)
-def test_corrupt_files_are_reported_in_one_line(home, tmp_path, capsys, name):
-    damage, message = DAMAGE[name]
-    (tmp_path / "bad.fcos").write_bytes(damage((home / "detector.fcos").read_bytes()))
-    words = ["detect", str(home / "cloud.npy"), "--checkpoint", str(tmp_path / "bad.fcos")]
-    assert_one_line_error(capsys, [*words, "--out", str(tmp_path / "a.json")], f"bad.fcos: {message}")
+def test_a_file_of_an_older_version_is_read(home, tmp_path):
+    _, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
+    record = json.loads(line)
+    for section, name in (("model", "regression_axes"), ("loss", "quality"), ("inference", "flips")):
+        del record["config"][section][name]
+    content = json.dumps(record).encode() + b"\n" + program
+    (tmp_path / "older.fcos").write_bytes(f"fcos-lidar-detector 1 {checksum(content)}\n".encode() + content)
+    assert load_exported(tmp_path / "older.fcos").config == load_exported(home / "detector.fcos").config
 
 
 @pytest.mark.parametrize(
-    "command_line", ["detect HOME/cloud.npy", "stream HOME/cloud.npy", "benchmark HOME/cloud.npy"]
+    ("damage", "message"),
+    [
+        (lambda content: b"PK\x03\x04" + content, "found a file, expected a checkpoint folder or a file"),
+        (lambda content: content.replace(b"r 1", b"r 2", 1), "format: got '2', expected 1"),
+        (lambda content: content.replace(b'"car"', b'"cat"', 1), ": damaged"),
+        (lambda content: content[:-9] + bytes([content[-9] ^ 1]) + content[-8:], ": damaged"),
+        (lambda content: content[:-100], ": damaged"),
+        (lambda content: b"", "found a file, expected a checkpoint folder or a file"),
+    ],
+    ids=["foreign", "other format", "record", "program", "cut", "empty"],
 )
-def test_no_command_overwrites_its_detector(home, capsys, command_line):
-    content = (home / "detector.fcos").read_bytes()
-    words = command_line.replace("HOME", str(home)).split()
-    detector = str(home / "detector.fcos")
-    message = "--out: .* inside of the checkpoint, expected a path elsewhere"
-    assert_one_line_error(capsys, [*words, "--checkpoint", detector, "--out", detector], message)
-    assert (home / "detector.fcos").read_bytes() == content
+def test_damaged_files_are_refused(home, tmp_path, damage, message):
+    (tmp_path / "bad.fcos").write_bytes(damage((home / "detector.fcos").read_bytes()))
+    with refused("bad.fcos: ", message):
+        load_exported(tmp_path / "bad.fcos")
 
 
-WRONG = {
-    "--points 0": "points: got 0, expected at least 1, or any",
-    "--batch 0": "batch: got 0, expected at least 1, or any",
-    "--out HOME/checkpoint/a": "--out: .* inside of the checkpoint, expected a path elsewhere",
-    "--out HOME": "found a folder",
-    "--checkpoint HOME/detector.fcos": "found a file, expected a checkpoint folder",
-}
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            "detect HOME/cloud.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos",
+            "inside of the checkpoint",
+        ),
+        (
+            "stream HOME/cloud.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos",
+            "inside of the checkpoint",
+        ),
+        ("benchmark --checkpoint HOME/detector.fcos --out HOME/detector.fcos", "inside of the checkpoint"),
+        ("export --checkpoint HOME/checkpoint --out HOME/checkpoint/a", "inside of the checkpoint"),
+        ("export --checkpoint HOME/checkpoint --out HOME", "found a folder"),
+        ("export --checkpoint HOME/detector.fcos --out HOME/a", "found a file, expected a checkpoint folder"),
+    ],
+)
+def test_no_command_overwrites_its_detector(home, capsys, line, message):
+    before = sorted(home.rglob("*")), (home / "detector.fcos").read_bytes()
+    assert_one_line_error(capsys, line.replace("HOME", str(home)).split(), message)
+    assert before == (sorted(home.rglob("*")), (home / "detector.fcos").read_bytes())
 
 
-@pytest.mark.parametrize("options", WRONG)
-def test_invalid_options_are_reported_in_one_line(home, tmp_path, capsys, options):
-    line = f"export {options}"
-    line += "" if "--checkpoint " in line else " --checkpoint HOME/checkpoint"
-    line += "" if "--out" in line else f" --out {tmp_path / 'a.fcos'}"
-    assert_one_line_error(capsys, line.replace("HOME", str(home)).split(), WRONG[options])
-    assert list(tmp_path.iterdir()) == []
+@pytest.fixture(scope="module")
+def linear(tmp_path_factory):
+    """A detector with a network of one layer and a second look, and its export for any points and clouds."""
+    folder = tmp_path_factory.mktemp("linear")
+    with linear_network():
+        detector = TrainedDetector(build_detector(REFINED, SENSOR), untrained(REFINED, SENSOR))
+        save_checkpoint(folder / "checkpoint", Checkpoint(REFINED, SENSOR, detector.variables, 7))
+        line = "export --points any --batch any --checkpoint", folder / "checkpoint", "--out", folder / "any.fcos"
+        command(*line)
+    return detector, folder / "any.fcos"
+
+
+@pytest.fixture(scope="module")
+def program(linear):
+    return jax.jit(load_exported(linear[1]).exported.call)
+
+
+def padded(clouds):
+    """Clouds f32[2, 1024, 5], and where they have points."""
+    points, valid = np.zeros((2, 1024, 5), np.float32), np.zeros((2, 1024), bool)
+    for row, cloud in enumerate(clouds):
+        points[row, : len(cloud)], valid[row, : len(cloud)] = cloud, True
+    return points, valid
+
+
+def test_an_export_for_any_number_of_points_and_clouds(linear, program):
+    record = load_exported(linear[1]).record
+    assert (record["num_points"], record["batch"]) == ("any", "any")
+    clouds = [make_frame(seed, SENSOR).points for seed in range(2)]
+    for scores, cloud in zip(program(*padded(clouds), True)["scores"], clouds, strict=True):
+        expected = linear[0](cloud).scores
+        assert len(expected) > 0
+        np.testing.assert_allclose(scores[: len(expected)], expected, atol=1e-4)
+        assert not scores[len(expected) :].any()
+
+
+def test_the_program_cleans_raw_clouds(program):
+    points, valid = padded([raw_cloud(), make_frame(1, SENSOR).points])
+    clean = valid.copy()
+    clean[0, BAD_ROWS] = False
+    found = program(points, valid, True)
+    assert bits(found) == bits(program(points, clean, False))
+    assert bits(found) != bits(program(points, valid, False))
+
+
+def test_exports_are_deterministic_and_contain_no_path_of_this_machine(home, linear):
+    detector, file = linear
+    jax.clear_caches()
+    assert export_detector(detector, num_points="any", batch="any") == file.read_bytes()
+    for trace in (str(ROOT), str(home), sys.prefix, str(Path.home()), ".py", "site-packages"):
+        assert trace.encode() not in (home / "detector.fcos").read_bytes(), trace
+
+
+def test_sizes_must_be_positive(linear):
+    for options, name in (({"num_points": 0}, "points"), ({"batch": 0}, "batch")):
+        with refused(f"{name}: got 0, expected at least 1, or any"):
+            export_detector(linear[0], **options)

@@ -10,7 +10,6 @@ from tiny_run import bits
 
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference import detector as detector_module
-from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 
@@ -103,12 +102,12 @@ def test_a_projected_cloud_is_finite_and_contains_each_point_at_most_once(sensor
     assert filled_cells
 
 
-def test_boxes_are_finite():
-    detector, boxes = load_trained("quickstart"), 0
+def test_boxes_are_finite(detector):
+    boxes = 0
     config = dataclasses.replace(detector.config, num_sweeps=100)  # damaged time lags are not refused
     for seed in range(10):
         rng = np.random.default_rng([0, seed, 1])
-        points = make_points(rng, detector.sensor, int(rng.choice([1, 7, 500, 3000, 6000])))
+        points = make_points(rng, detector.sensor, int(rng.choice([1, 7, 500, 1000, 2000])))
         cloud = make_cloud(points, config, sensor=detector.sensor)
         found, again = detector.detect(cloud), detector.detect(cloud)
         assert np.isfinite(found.boxes).all(), seed

@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_run import TINY_CONFIG, TINY_REFINED, untrained
+from tiny_run import CONFIG, REFINED, SENSOR, untrained
 
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.inference.onnx_program import program_graph
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
 pytestmark = pytest.mark.slow
@@ -23,14 +22,12 @@ onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime, of the ext
 
 def tiny(config, **projection):
     config = dataclasses.replace(config, projection=dataclasses.replace(config.projection, **projection))
-    return TrainedDetector(build_detector(config, TINY), untrained(config, TINY))
+    return TrainedDetector(build_detector(config, SENSOR), untrained(config, SENSOR))
 
 
 DETECTORS = {
     "quickstart": lambda: load_trained("quickstart"),
-    "hdl32e": lambda: load_trained("hdl32e"),
-    "tiny with a second look": lambda: tiny(TINY_REFINED),
-    "tiny with five rounds": lambda: tiny(TINY_CONFIG, num_rounds=5),
+    "tiny with five rounds and a second look": lambda: tiny(REFINED, num_rounds=5),
 }
 
 
@@ -38,7 +35,7 @@ DETECTORS = {
 def test_boxes_equal_xlas_except_for_rounding(name):
     detector = DETECTORS[name]()
     session = onnxruntime.InferenceSession(program_graph(detector), providers=["CPUExecutionProvider"])
-    for seed in range(1 if name == "hdl32e" else 3):  # of which the full size takes seconds per cloud
+    for seed in range(3):
         cloud = make_cloud(make_frame(seed, detector.sensor).points, detector.config, sensor=detector.sensor)
         boxes, scores, labels, used = session.run(None, {"points": cloud.points, "valid": cloud.valid})
         expected = detector.detect(cloud)
@@ -52,11 +49,11 @@ def test_boxes_equal_xlas_except_for_rounding(name):
 
 
 def test_unusable_rows_and_points_on_the_vehicle_are_dropped_and_the_file_is_deterministic():
-    detector = tiny(TINY_CONFIG)
+    detector = tiny(CONFIG)
     content = program_graph(detector)
     assert program_graph(detector) == content
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    cloud = make_cloud(make_frame(0, TINY).points, TINY_CONFIG, sensor=TINY)
+    cloud = make_cloud(make_frame(0, SENSOR).points, CONFIG, sensor=SENSOR)
     points, rows = cloud.points.copy(), np.flatnonzero(~cloud.valid)[:4]
     points[rows, :5] = [[0.1, 0, 0, 9, 0], [9, 9, np.nan, 9, 0], [9, 9, 0, 1e30, 0], [9, 9, 0, 9, -1]]
     clean, dirty = (
@@ -71,7 +68,7 @@ def test_unusable_rows_and_points_on_the_vehicle_are_dropped_and_the_file_is_det
 
 
 def test_what_has_no_form_in_the_graph_is_refused():
-    detector = tiny(TINY_CONFIG)
+    detector = tiny(CONFIG)
     prepare = detector.model.prepare
     model = detector.model._replace(prepare=lambda *cloud: jax.tree.map(jnp.tan, prepare(*cloud).features))
     with pytest.raises(ValueError, match=r"^ONNX: prepare: found the primitive tan, which has no rule$"):

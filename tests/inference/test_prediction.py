@@ -7,17 +7,11 @@ import jax
 import numpy as np
 import pytest
 from refusal import refused
-from tiny_run import CONFIG, FRAMES, TESTS, weights
+from tiny_run import FRAMES, TESTS
 
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames, WrappedFrames
-from fcos_lidar_jax.inference import TrainedDetector, prediction
+from fcos_lidar_jax.inference import prediction
 from fcos_lidar_jax.inference.prediction import evaluate, predict
-from fcos_lidar_jax.models import build_detector
-
-
-@pytest.fixture(scope="module")
-def detector():
-    return TrainedDetector(build_detector(CONFIG, FRAMES.sensor), weights())
 
 
 @pytest.fixture

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 from refusal import refused
+from tiny_run import CONFIG, SENSOR
 from toy_frames import ToyFrames
 
 from fcos_lidar_jax.data.cloud_policy import Cloud
-from fcos_lidar_jax.inference import load_detector
+from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.inference import prediction_log as results
 from fcos_lidar_jax.inference.loop import Prediction
+from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.types import Detections
 
 
@@ -37,32 +39,24 @@ def boxes_cloud_and_note(num_dropped):
     return Detections(*nothing, num_dropped=np.int32(num_dropped)), cloud, note
 
 
-@pytest.mark.parametrize("unusable", [1, 3])
-def test_frames_without_usable_points_are_reported_and_only_such_frames_refused(
-    unusable, monkeypatch, tmp_path, capsys
-):
+def run_with(monkeypatch, predict, out, **how):
+    """Write the predictions of a stand-in for the detection."""
+    monkeypatch.setattr(results, "predict", predict)
+    how = {"entries": lambda found: ([], ""), "write": lambda path, entries: path.write_text("")} | how
+    detector = TrainedDetector(build_detector(CONFIG, SENSOR), {})
+    results.write_predictions(detector, ToyFrames(size=3), out, **how)
+
+
+def test_a_run_without_any_usable_points_is_refused(monkeypatch, tmp_path):
     def predict(detector, frames, *, indices, **how):
         for index in indices:
-            boxes, cloud, note = boxes_cloud_and_note(9 if index < unusable else 4)
+            boxes, cloud, note = boxes_cloud_and_note(9)
             yield Prediction(index, boxes, None, cloud, note)
 
-    monkeypatch.setattr(results, "predict", predict)
-    detector = load_detector("quickstart")
-    frames, out = ToyFrames(size=3), tmp_path / "detections.json"
-
-    def run():
-        how = {"entries": lambda found: ([], ""), "write": lambda path, entries: path.write_text("")}
-        results.write_predictions(detector, frames, out, **how)
-
-    first = "none of its 9 points is usable"
-    if unusable == 3:
-        for _ in range(2):
-            with refused(first):
-                run()
-        assert not out.exists()
-        return
-    run()
-    assert f"note: 1 of 3 clouds without usable points, and so without boxes: {first}" in capsys.readouterr().err
+    for _ in range(2):
+        with refused("none of its 9 points is usable"):
+            run_with(monkeypatch, predict, tmp_path / "detections.json")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_frames_without_usable_points_of_other_processes_are_counted(monkeypatch, tmp_path, capsys):
@@ -77,10 +71,8 @@ def test_frames_without_usable_points_of_other_processes_are_counted(monkeypatch
         return np.concatenate([own, [next(others)]]) if own.dtype == bool else own
 
     assert [results._in_any_process(flag) for flag in (True, False)] == [True, False]
-    monkeypatch.setattr(results, "predict", predict)
     monkeypatch.setattr(results.multihost_utils, "process_allgather", of_two)
-    how = {"entries": lambda found: ([], ""), "write": lambda path, entries: [*entries]}
-    results.write_predictions(load_detector("quickstart"), ToyFrames(size=3), tmp_path / "x.json", **how)
+    run_with(monkeypatch, predict, tmp_path / "x.json")
     told = capsys.readouterr().err
     assert "note: 2 of 3 clouds without usable points" in told
     assert "the first is toy 0: no usable points\n" in told
@@ -88,7 +80,7 @@ def test_frames_without_usable_points_of_other_processes_are_counted(monkeypatch
 
 @pytest.mark.parametrize(
     ("options", "clouds", "again"),
-    [(None, "a", [0, 2, 3]), ([0.5], "a", [0, 1, 2, 3]), (None, "changed", [0, 1, 2, 3])],
+    [(None, "a", [0, 2]), ([0.5], "a", [0, 1, 2]), (None, "changed", [0, 1, 2])],
 )
 def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_before(
     monkeypatch, tmp_path, capsys, options, clouds, again
@@ -100,25 +92,21 @@ def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_
             if len(detected) == 2:
                 detected.append("interrupted")
                 raise KeyboardInterrupt
-            boxes, cloud, note = boxes_cloud_and_note(9 if index in (0, 3) else 4)
+            boxes, cloud, note = boxes_cloud_and_note(9 if index in (0, 2) else 4)
             detected.append(index)
             yield Prediction(index, boxes, None, cloud, note)
 
     def run(**how):
-        how |= {
-            "entries": lambda found: ([{"index": found.index}], ""),
-            "write": lambda _, found: written.extend(found),
-        }
-        results.write_predictions(load_detector("quickstart"), ToyFrames(size=4), tmp_path / "x.json", **how)
+        entries, write = lambda found: ([{"index": found.index}], ""), lambda _, found: written.extend(found)
+        run_with(monkeypatch, predict, tmp_path / "x.json", entries=entries, write=write, **how)
 
-    monkeypatch.setattr(results, "predict", predict)
     monkeypatch.setattr(ToyFrames, "clouds_fingerprint", lambda *_: "a")
     with pytest.raises(KeyboardInterrupt):
         run()
     monkeypatch.setattr(ToyFrames, "clouds_fingerprint", lambda *_: clouds)
     run(options=options)
     assert detected == [0, 1, "interrupted", *again]
-    assert written == [(f"toy {i}", b'[{"index": %d}]' % i) for i in range(4)]
+    assert written == [(f"toy {i}", b'[{"index": %d}]' % i) for i in range(3)]
     told = capsys.readouterr().err
-    assert "note: 2 of 4 clouds without usable points" in told
-    assert "frames 4/4" in told
+    assert "note: 2 of 3 clouds without usable points, and so without boxes: the first is none of its 9" in told
+    assert "frames 3/3" in told

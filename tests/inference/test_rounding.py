@@ -15,31 +15,39 @@ pytestmark = pytest.mark.slow
 
 
 def rounded(x, bits):
-    """The nearest float32 with this number of fraction bits, ties to even."""
-    word, cut = jax.lax.bitcast_convert_type(x, jnp.uint32), 23 - bits
-    word = word + ((word >> cut) & 1) + jnp.uint32((1 << (cut - 1)) - 1)
-    return jax.lax.bitcast_convert_type(word >> cut << cut, jnp.float32)
+    """The nearest float32 with this number of fraction bits, at most 23, ties to even."""
+    word, cut = jax.lax.bitcast_convert_type(x, jnp.uint32), jnp.uint32(23 - bits)
+    near = word + ((word >> cut) & 1) + (jnp.uint32(1) << cut >> 1) - 1
+    return jnp.where(cut > 0, jax.lax.bitcast_convert_type(near >> cut << cut, jnp.float32), x)
 
 
 @pytest.fixture(scope="module")
-def exact():
-    """The shipped detector, an image, and its predictions without rounding."""
-    trained = load_trained("hdl32e")
+def predict():
+    """Predictions of the shipped detector in an image, with heads rounded to a number of bits; compiled once."""
+    trained, convolve = load_trained("hdl32e"), heads.convolve
     stages, frame = make_stages(trained.model), unseen_frames(trained.sensor, 1).frame(0)
     cloud = make_cloud(frame.points, trained.config, sensor=trained.sensor)
-    image = jax.jit(stages.prepare)(cloud.points, cloud.valid)
-    return trained, stages.network, image, jax.jit(stages.network)(trained.variables, image)
+    image = stages.prepare(cloud.points, cloud.valid)
+
+    @jax.jit
+    def network(bits, variables, image):
+        def rough(x, kernel, **how):
+            return convolve(rounded(x, bits), rounded(kernel, bits), **how)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(heads, "convolve", rough)
+            return stages.network(variables, image)
+
+    return trained.config.inference.min_probability, lambda bits: network(bits, trained.variables, image)
 
 
 @pytest.mark.parametrize(("bits", "largest_mm"), [(10, 2.0), (7, 16.0)], ids=["TF32", "bfloat16"])
-def test_rounding_in_the_heads_moves_centres_by_millimetres(bits, largest_mm, exact, monkeypatch):
+def test_rounding_in_the_heads_moves_centres_by_millimetres(bits, largest_mm, predict):
     """Emulates the default rounding of GPUs (TF32) and TPUs (bfloat16); with ``pytest -s``, prints the effect."""
-    trained, network, image, exact = exact
-    convolve = heads.convolve
-    monkeypatch.setattr(heads, "convolve", lambda x, k, **how: convolve(rounded(x, bits), rounded(k, bits), **how))
-    rough = jax.jit(lambda *given: network(*given))(trained.variables, image)
+    threshold, network = predict
+    exact, rough = network(23), network(bits)
     probability, other = (np.asarray(jax.nn.softmax(outputs.logits))[:, :-1] for outputs in (exact, rough))
-    place, label = np.nonzero(probability > trained.config.inference.min_probability)
+    place, label = np.nonzero(probability > threshold)
     moved_mm = 1e3 * np.abs(exact.regression - rough.regression)[place, :3, label].max()
     change = np.abs(probability - other).max()
     print(f"{len(place)} predictions: centres move by at most {moved_mm:.2f} mm, probabilities by {change:.5f}")

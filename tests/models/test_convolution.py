@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 from commands import run_python
 from jax import export, lax
-from tiny_run import CONFIG, SENSOR, host_batch, weights
 
-from fcos_lidar_jax.models import build_detector, convolution
+from fcos_lidar_jax.models import convolution
 from fcos_lidar_jax.models.convolution import convolve
-from fcos_lidar_jax.training.step import make_gradient
 
 CASES = {
     "3x3": ((3, 3, 6, 5), {}),
-    "7x7": ((7, 7, 3, 4), {}),
     "3x5": ((3, 5, 3, 4), {}),
     "dilated": ((3, 3, 4, 7), {"dilation": 3}),
     "circular": ((3, 3, 4, 5), {"dilation": 2, "circular": True}),
@@ -67,8 +64,10 @@ def assert_close(found, expected, tolerance):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
 
 
-@pytest.mark.parametrize("dtype", TOLERANCES)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    ("case", "dtype"),
+    [*((case, "float32") for case in CASES), *((case, "bfloat16") for case in ("circular", "1x1"))],
+)
 def test_values_and_gradients_are_the_librarys(case, dtype):
     function, (x, kernel, weights), values, expected = example(case, dtype)
     found = jax.jit(gradients(function))(x, kernel, weights)
@@ -76,7 +75,7 @@ def test_values_and_gradients_are_the_librarys(case, dtype):
     assert_close([function(x, kernel), *found], [values, *expected], TOLERANCES[dtype])
 
 
-@pytest.mark.parametrize("case", ["3x3", "circular", "strided", "1x1"])
+@pytest.mark.parametrize("case", ["circular", "1x1"])
 def test_batches_of_gradients_and_gradients_of_batches(case):
     """Per-sample gradients add up to the batch's; so does the gradient of a mapped function, recomputed or not."""
     function, (x, kernel, weights), _, (to_x, to_kernel) = example(case)
@@ -93,9 +92,7 @@ def test_batches_of_gradients_and_gradients_of_batches(case):
     [
         ((3, 3), 3, False, "float32"),
         ((3, 3), 2, True, "bfloat16"),
-        ((5, 3), 2, False, "float32"),
         ((5, 3), 3, True, "float32"),
-        ((3, 1), 3, True, "float32"),
     ],
 )
 def test_weight_gradients_by_phases_are_the_librarys(size, circular, dilation, dtype):
@@ -174,43 +171,25 @@ def test_small_images_have_no_rows(monkeypatch):
         assert program.as_text().count("stablehlo.while") == loops
 
 
-@pytest.mark.slow
-def test_a_networks_losses_and_gradients_are_those_with_the_librarys(monkeypatch):
-    detector = build_detector(CONFIG, SENSOR)
-    given = weights()["params"], weights()["batch_stats"], host_batch()
-    runs = []
-    for large in (0, math.inf):
-        monkeypatch.setattr(convolution, "LARGE", large)
-        gradient = make_gradient(detector)
-        runs.append(jax.device_get(jax.jit(lambda *given, gradient=gradient: gradient(*given))(*given)))
-    (found, _, metrics), (expected, _, expected_metrics) = runs
-    assert int(metrics["positives"]) > 0
-    assert_close(*(jax.tree.leaves(tree) for tree in (metrics, expected_metrics)), 1e-5)
-    largest = max(np.abs(leaf).max() for leaf in jax.tree.leaves(expected))
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * largest)
-
-
 SHARDED = """
 import jax, re
 from jax.sharding import NamedSharding, PartitionSpec
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
-from test_convolution import CASES, TOLERANCES, assert_close, convolution, example, gradients
+from test_convolution import TOLERANCES, assert_close, convolution, example, gradients
 convolution.LARGE = 0
 mesh = make_mesh()
 assert mesh.size == 2
-for case in CASES:
-    for dtype, tolerance in TOLERANCES.items():
-        function, (x, kernel, weights), _, expected = example(case, dtype, batch=4)
-        places = NamedSharding(mesh, PartitionSpec("data")), NamedSharding(mesh, PartitionSpec())
-        gradient = jax.jit(gradients(function), out_shardings=places)
-        arguments = shard_batch(x, mesh), replicate(kernel, mesh), shard_batch(weights, mesh)
-        assert_close(gradient(*arguments), expected, tolerance)
-        text = gradient.lower(*arguments).compile().as_text()
-        # The sums over samples are exchanged, once, and no image.
-        assert "all-gather" not in text and "all-to-all" not in text, case
-        assert len(re.findall(r" all-reduce(?:-start)?[(]", text)) == 1, case
-        assert not re.search(r"all-reduce.*while/body", text), case
+for case in ("circular", "1x1"):
+    function, (x, kernel, weights), _, expected = example(case, batch=4)
+    places = NamedSharding(mesh, PartitionSpec("data")), NamedSharding(mesh, PartitionSpec())
+    gradient = jax.jit(gradients(function), out_shardings=places)
+    arguments = shard_batch(x, mesh), replicate(kernel, mesh), shard_batch(weights, mesh)
+    assert_close(gradient(*arguments), expected, TOLERANCES["float32"])
+    text = gradient.lower(*arguments).compile().as_text()
+    # The sums over samples are exchanged, once, and no image.
+    assert "all-gather" not in text and "all-to-all" not in text, case
+    assert len(re.findall(r" all-reduce(?:-start)?[(]", text)) == 1, case
+    assert not re.search(r"all-reduce.*while/body", text), case
 """
 
 

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_run import CONFIG, SENSOR, images_of
+from tiny_run import CONFIG, SENSOR
 
-from fcos_lidar_jax.locations import STRIDES, image_layout
-from fcos_lidar_jax.models import build_detector, count_parameters
-from fcos_lidar_jax.models.heads import Head
+from fcos_lidar_jax.locations import STRIDES
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.models.heads import Head, Heads
 from fcos_lidar_jax.models.layers import EPSILON
 from fcos_lidar_jax.models.local_geometry import (
     COLUMNS,
@@ -76,9 +76,8 @@ def test_offsets_are_their_definition_in_loops_also_under_jit_and_vmap(circular,
     def compute(image):
         return local_offsets(image, mean=MEAN, scale=SCALE, circular=circular)
 
-    np.testing.assert_allclose(compute(image), expected, atol=1e-3)
     np.testing.assert_allclose(jax.jit(compute)(image), expected, atol=1e-3)
-    np.testing.assert_allclose(jax.vmap(compute)(image[:, None])[:, 0], expected, atol=1e-3)
+    np.testing.assert_allclose(jax.jit(jax.vmap(compute))(image[:, None])[:, 0], expected, atol=1e-3)
     assert 0.2 < (expected[..., 3::4] == 1).mean() < 0.8
     assert len(window()) == 20
 
@@ -109,22 +108,14 @@ def test_offsets_between_rounds_are_their_definition_in_loops(rounds):
 
     expected = later_by_loops(image, rounds)
     assert expected.shape[-1] == 5 * (rounds - 1)
-    np.testing.assert_allclose(compute(image), expected, atol=1e-3)
     np.testing.assert_allclose(jax.jit(compute)(image), expected, atol=1e-3)
-    np.testing.assert_allclose(jax.vmap(compute)(image[:, None])[:, 0], expected, atol=1e-3)
+    np.testing.assert_allclose(jax.jit(jax.vmap(compute))(image[:, None])[:, 0], expected, atol=1e-3)
     if rounds > 1:
         assert 0.2 < (expected[..., 4::5] == 1).mean() < 0.8
         assert len(np.unique(expected[..., 3::5])) > 9
 
 
-def test_features_with_later_rounds_use_their_offsets():
-    image = image_of(rounds=2)[0]
-    module = LocalGeometry(5, MEAN, SCALE, later_rounds=True)
-    variables = module.init(jax.random.key(0), image, train=False)
-    assert variables["params"]["linear0"].shape == (90, HIDDEN)
-    features = module.apply(variables, image, train=False)
-    moved = image.at[..., 1].add(jnp.where(image[..., 15] > 0, 0.1, 0.0))  # x of the second round
-    assert float(jnp.abs(module.apply(variables, moved, train=False) - features).max()) > 0
+def test_offsets_of_later_rounds_belong_to_local_geometry():
     with pytest.raises(ValueError, match="round_offsets: got True, expected False without local_geometry"):
         dataclasses.replace(CONFIG.model, local_geometry=False, round_offsets=True)
 
@@ -174,52 +165,32 @@ def test_gradients_are_finite_where_nothing_is_near():
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradients))
 
 
-def both_detectors(tied: bool):
-    """A detector without and with local geometry."""
-    model = dataclasses.replace(CONFIG.model, tied_heads=tied)
-    models = model, dataclasses.replace(model, local_geometry=True)
-    return [build_detector(dataclasses.replace(CONFIG, model=model), SENSOR) for model in models]
-
-
 @pytest.mark.parametrize("tied", [False, True])
-def test_it_has_parameters_of_its_own_and_in_the_heads(tied):
-    shapes = [jax.eval_shape(each.init, jax.random.key(0))["params"] for each in both_detectors(tied)]
-    before, parts = map(count_parameters, shapes)
-    width = CONFIG.model.fpn_channels
-    assert parts["local_geometry"] == 85 * HIDDEN + HIDDEN * width + 2 * (HIDDEN + width)
-    heads = 1 if tied else len(STRIDES)
-    assert parts["heads"] - before["heads"] == heads * 2 * width * CONFIG.model.head_channels
-    assert all(parts[name] == number for name, number in before.items() if name not in ("heads", "total"))
+def test_it_joins_both_towers_of_each_head(tied):
+    model = dataclasses.replace(CONFIG.model, local_geometry=True, tied_heads=tied)
+    detector = build_detector(dataclasses.replace(CONFIG, model=model), SENSOR)
+    heads = jax.eval_shape(detector.init, jax.random.key(0))["params"]["heads"]
+    assert len(heads) == (1 if tied else len(STRIDES))
+    assert all({"classification_local", "regression_local"} <= head.keys() for head in heads.values())
 
 
-@pytest.mark.slow
 def test_it_joins_the_heads_of_every_level_and_nothing_else_changes():
-    plain, local = both_detectors(tied=True)
-    variables = local.init(jax.random.key(0))
     rng = np.random.default_rng(0)
-    features = rng.uniform(1, 5, (1, SENSOR.num_rows, SENSOR.num_columns, 9, CONFIG.projection.num_rounds))
-    features = images_of(jnp.asarray(features, jnp.float32))
-    apply = jax.jit(local.apply)
-    found, _ = apply(variables, features)
-    silent = jax.tree.map(lambda leaf: leaf, variables)
-    silent["params"]["local_geometry"]["norm1"] = jax.tree.map(
-        jnp.zeros_like, variables["params"]["local_geometry"]["norm1"]
-    )
-    without = {name: {k: v for k, v in tree.items() if k != "local_geometry"} for name, tree in variables.items()}
-    without["params"]["heads"] = jax.tree.map(
-        lambda head: {name: leaves for name, leaves in head.items() if not name.endswith("_local")},
-        variables["params"]["heads"],
-        is_leaf=lambda tree: "classification_tower" in tree,
-    )
-    expected, _ = jax.jit(plain.apply)(without, features)
-    close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-5)  # Another program rounds otherwise.
-    jax.tree.map(close, apply(silent, features)[0], expected)
-    first = 0
-    for size in image_layout(SENSOR, CONFIG.model).level_sizes:
-        level = slice(first, first + size)
-        assert float(jnp.abs(found.logits[:, level] - expected.logits[:, level]).max()) > 0
-        assert float(jnp.abs(found.regression[:, level] - expected.regression[:, level]).max()) > 0
-        first += size
+    shapes = [(1, 8 // stride or 1, 16 // stride or 1, 8) for stride in STRIDES[:4]]
+    levels, local = ([jnp.asarray(rng.uniform(size=shape), jnp.float32) for shape in shapes] for _ in range(2))
+    heads = Heads(3, 8, 1, 0.9, tied=True)
+    params = jax.jit(heads.init)(jax.random.key(0), levels, local)["params"]
+    plain = {"shared": {name: part for name, part in params["shared"].items() if not name.endswith("_local")}}
+    apply = jax.jit(heads.apply)
+    expected = apply({"params": plain}, levels)
+    silent = apply({"params": params}, levels, jax.tree.map(jnp.zeros_like, local))
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), silent, expected)
+    found, first = apply({"params": params}, levels, local), 0
+    for _, height, width, _ in shapes:
+        level = slice(first, first + height * width)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            assert float(jnp.abs(a[:, level] - b[:, level]).max()) > 0
+        first = level.stop
 
 
 def test_a_location_is_given_the_features_of_its_own_pixel():

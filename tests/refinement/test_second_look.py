@@ -1,4 +1,4 @@
-"""The second look as a stage of both detectors, and trained in their step."""
+"""The second look as a stage of a detector, and trained in its step."""
 
 import dataclasses
 import functools
@@ -24,8 +24,6 @@ pytestmark = pytest.mark.slow
 
 SMALL = dataclasses.replace(tiny_run.LOOK, first_score_weight=0.25)
 FROZEN = dataclasses.replace(SMALL, freeze_detector=True)
-CONFIGS = {"FCOS-LiDAR": tiny_run.CONFIG, "CenterPoint": tiny_peer.CONFIG}
-BOTH = pytest.mark.parametrize("name", CONFIGS)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,34 +34,33 @@ def _quick_network():
 
 
 @functools.cache
-def detector(name: str, refinement: RefinementConfig | None):
+def detector(refinement: RefinementConfig | None):
     """A detector, and random weights of it."""
-    config = dataclasses.replace(CONFIGS[name], refinement=refinement)
+    config = dataclasses.replace(tiny_run.CONFIG, refinement=refinement)
     return build_detector(config, SENSOR), jax.tree.map(jnp.asarray, untrained(config, SENSOR))
 
 
 @functools.cache
-def detect(name: str, refinement: RefinementConfig | None):
-    return jax.jit(make_detect(detector(name, refinement)[0]))
+def detect(refinement: RefinementConfig | None):
+    return jax.jit(make_detect(detector(refinement)[0]))
 
 
 @functools.cache
-def gradient(name: str, refinement: RefinementConfig | None):
-    return jax.jit(make_gradient(detector(name, refinement)[0]))
+def gradient(refinement: RefinementConfig | None):
+    return jax.jit(make_gradient(detector(refinement)[0]))
 
 
-def found(name: str, refinement: RefinementConfig | None, variables=None):
-    batch, variables = host_batch(), variables or detector(name, refinement)[1]
-    return jax.device_get(detect(name, refinement)(variables, batch.points[0], batch.valid[0]))
+def found(refinement: RefinementConfig | None, variables=None):
+    batch, variables = host_batch(), variables or detector(refinement)[1]
+    return jax.device_get(detect(refinement)(variables, batch.points[0], batch.valid[0]))
 
 
-@BOTH
-def test_boxes_are_the_detectors_best_with_the_mean_of_both_scores(name):
+def test_boxes_are_the_detectors_best_with_the_mean_of_both_scores():
     """With zero weights all classes are equally probable and no box moves."""
-    _, variables = detector(name, SMALL)
+    _, variables = detector(SMALL)
     zero = jax.tree.map(jnp.zeros_like, variables["params"]["refinement"])
-    after = found(name, SMALL, variables | {"params": variables["params"] | {"refinement": zero}})
-    before = found(name, None)
+    after = found(SMALL, variables | {"params": variables["params"] | {"refinement": zero}})
+    before = found(None)
     number = int(before.valid.sum())
     assert number > 8
     assert after.valid.sum() == 8
@@ -77,7 +74,7 @@ def test_boxes_are_the_detectors_best_with_the_mean_of_both_scores(name):
 
 
 def test_moved_boxes_are_sorted_by_different_scores():
-    after = found("FCOS-LiDAR", SMALL)
+    after = found(SMALL)
     number = int(after.valid.sum())
     assert 0 < number <= 8
     assert (np.diff(after.scores[:number]) <= 0).all()
@@ -85,15 +82,14 @@ def test_moved_boxes_are_sorted_by_different_scores():
 
 
 def test_the_detectors_own_losses_and_gradients_stay():
-    name = "FCOS-LiDAR"
-    _, variables = detector(name, None)
-    _, both = detector(name, SMALL)
+    _, variables = detector(None)
+    _, both = detector(SMALL)
     batch, own = host_batch(), variables["params"]
-    alone, _, metrics = gradient(name, None)(own, variables["batch_stats"], batch)
+    alone, _, metrics = gradient(None)(own, variables["batch_stats"], batch)
     params = own | {"refinement": both["params"]["refinement"]}
-    joint, _, with_look = gradient(name, SMALL)(params, variables["batch_stats"], batch)
-    for name_of, of_part in alone.items():
-        for a, b in zip(*map(jax.tree.leaves, (of_part, joint[name_of])), strict=True):
+    joint, _, with_look = gradient(SMALL)(params, variables["batch_stats"], batch)
+    for name, of_part in alone.items():
+        for a, b in zip(*map(jax.tree.leaves, (of_part, joint[name])), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-4 * max(1.0, float(jnp.abs(a).max())))
     assert float(with_look["loss/refined_class"]) > 0
     assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(joint["refinement"])) > 0
@@ -102,7 +98,7 @@ def test_the_detectors_own_losses_and_gradients_stay():
 
 
 def test_a_frozen_detector_is_not_changed():
-    model, variables = detector("FCOS-LiDAR", FROZEN)
+    model, variables = detector(FROZEN)
     optimizer = make_optimizer(model.config.optimizer, 10)
     state = make_state(model, optimizer, jax.random.key(0), variables=variables)
     after, metrics = jax.jit(make_train_step(model, optimizer))(state, host_batch())
@@ -124,7 +120,7 @@ def test_a_frozen_detector_is_not_changed():
 
 def test_losses_equal_sums_over_the_samples():
     """Two samples are processed in a loop, one sample without it."""
-    model, variables = detector("FCOS-LiDAR", SMALL)  # of whose network nothing is asked
+    model, variables = detector(SMALL)  # of whose network nothing is asked
     batch = host_batch()
     boxes = jnp.concatenate([batch.boxes[0, :4], batch.boxes[1, :3] + 0.3]), jnp.linspace(0.9, 0.1, 7)
     labels = jnp.concatenate([batch.labels[0, :4], batch.labels[1, :3]])
@@ -144,19 +140,18 @@ def test_losses_equal_sums_over_the_samples():
 
 
 def test_a_cloud_without_points_has_finite_gradients_and_no_boxes():
-    case = "FCOS-LiDAR", SMALL
-    variables = detector(*case)[1]
+    variables = detector(SMALL)[1]
     batch = dataclasses.replace(host_batch(), valid=np.zeros((2, 1024), bool))
-    gradients, _, metrics = gradient(*case)(variables["params"], variables["batch_stats"], batch)
+    gradients, _, metrics = gradient(SMALL)(variables["params"], variables["batch_stats"], batch)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
     assert float(metrics["refined_boxes"]) == 0
-    empty = detect(*case)(variables, batch.points[0], batch.valid[0])
+    empty = detect(SMALL)(variables, batch.points[0], batch.valid[0])
     assert not empty.valid.any()
 
 
 def test_points_of_boxes_decide_the_scores():
     """The same boxes with other points: the network sees the cloud, not only the boxes."""
-    model, variables = detector("FCOS-LiDAR", SMALL)
+    model, variables = detector(SMALL)
     batch = host_batch()
     boxes = batch.boxes[0], np.linspace(0.9, 0.1, len(batch.boxes[0])), batch.labels[0], batch.box_valid[0]
     refine = jax.jit(model.refine)
@@ -166,6 +161,15 @@ def test_points_of_boxes_decide_the_scores():
     _, same, *_ = refine(variables, batch.points[0][order], batch.valid[0][order], *boxes)
     np.testing.assert_array_equal(scores, same)
     assert float(jnp.abs(scores - others).max()) > 0.1 * float(scores.max())
+
+
+def test_centerpoint_takes_a_second_look_too():
+    config = dataclasses.replace(tiny_peer.CONFIG, refinement=SMALL)
+    model, batch = build_detector(config, SENSOR), tiny_peer.host_batch()
+    variables = jax.eval_shape(model.init, jax.random.key(0))
+    assert jax.eval_shape(make_detect(model), variables, batch.points[0], batch.valid[0]).boxes.shape == (20, 9)
+    _, _, metrics = jax.eval_shape(make_gradient(model), variables["params"], variables["batch_stats"], batch)
+    assert {"loss/classification", "loss/refined_class", "loss/refined_box"} <= metrics.keys()
 
 
 def test_best_boxes_are_padded():
@@ -181,9 +185,9 @@ def test_training_starts_from_weights_with_or_without_a_second_look(tmp_path, ca
         (None, SMALL, "has no second look: it starts with random weights"),
         (SMALL, None, "the second look is left out"),
     ):
-        model, variables = detector("FCOS-LiDAR", given)
+        model, variables = detector(given)
         save_checkpoint(tmp_path / "weights", Checkpoint(model.config, SENSOR, variables, 1))
-        initial = plan._initial_weights(detector("FCOS-LiDAR", own)[0], tmp_path / "weights")
+        initial = plan._initial_weights(detector(own)[0], tmp_path / "weights")
         assert told in capsys.readouterr().err
         assert of_detector(initial) == of_detector(variables)
         assert ("refinement" in initial["params"]) == (own is not None)

@@ -59,13 +59,6 @@ def test_targets_equal_a_loop(seed):
     assert 0.25 in weight
 
 
-def test_a_box_of_the_right_class_stands_before_a_nearer_one():
-    boxes = np.array([[0.1, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0], [0.6, 0, 0, 4, 2, 1, 0]], np.float32)
-    truth = np.array([[0, 0, 0, 4, 2, 1, 0]], np.float32), np.array([2]), np.ones(1, bool)
-    assert match(boxes, np.array([0, 2, 2]), np.ones(3, bool), *truth, **OPTIONS).label.tolist() == [3, 2, 3]
-    assert match(boxes, np.array([0, 1, 1]), np.ones(3, bool), *truth, **OPTIONS).label.tolist() == [2, 3, 3]
-
-
 def test_without_boxes_or_objects_everything_is_background():
     boxes, labels, valid, *truth = map(jnp.asarray, scene(0))
     none = jnp.zeros((0, 7)), jnp.zeros(0, jnp.int32), jnp.zeros(0, bool)
