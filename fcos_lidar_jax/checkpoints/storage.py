@@ -288,11 +288,10 @@ def read_description(folder: Path) -> dict[str, Any]:
         raise CheckpointError(str(error)) from None
     if (version := description.get("format")) != _FORMAT:
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
-    if description.get("hash") != checksum(_canonical(description)):
+    kinds = {"step": int, "config": dict, "sensor": dict, "files": dict}
+    whole = all(isinstance(description.get(name), kind) for name, kind in kinds.items())
+    if not whole or description.get("hash") != checksum(_canonical(description)):
         raise CheckpointError(f"{file}: damaged: its hash does not match its content")
-    for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
-        if not isinstance(description.get(name), kind):
-            raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
     return {**description, "config": with_later_fields(description["config"])}
 
 
