@@ -179,15 +179,6 @@ def test_a_checkpoint_whose_folder_cannot_be_removed_yet_does_not_fail_the_save(
     assert list(copy.folder.glob(".*")) == []
 
 
-def test_leftovers_of_killed_saves_are_ignored_and_removed_by_the_next_save(copy):
-    (copy.folder / ".00000008.abc" / "variables").mkdir(parents=True)
-    shutil.copytree(copy.folder / "00000006", copy.folder / ".00000006.abc.old")
-    assert steps(copy) == [2, 4, 6]
-    save(copy, 8)
-    assert list(copy.folder.glob(".*")) == []
-    assert steps(copy) == [2, 4, 6, 8]
-
-
 def test_a_run_stands_for_its_last_or_best_checkpoint(copy):
     run = copy.folder.parent
     assert find_checkpoint(run) == copy.folder / "00000006"

@@ -164,26 +164,6 @@ def test_corruption_of_any_file_is_detected(copy):
     assert load_checkpoint(copy).step == 7
 
 
-def means_the_same(a, b):
-    try:
-        return json.loads(a) == json.loads(b)
-    except ValueError:
-        return False
-
-
-def test_a_flipped_bit_in_the_description_is_detected(copy, written):
-    """Unless the JSON is equal, as between tokens or in a last digit that is rounded away."""
-    content = (written / "checkpoint.json").read_bytes()
-    for at in np.random.default_rng(0).choice(len(content), 200, replace=False):
-        changed = bytearray(content)
-        changed[at] ^= 1
-        if means_the_same(changed, content):
-            continue
-        (copy / "checkpoint.json").write_bytes(changed)
-        with pytest.raises(CheckpointError, match=r"checkpoint\.json"):
-            load_checkpoint(copy)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -235,15 +215,6 @@ def test_only_a_checkpoint_is_replaced(copy, checkpoint):
     for free in (copy, copy.parent / "empty"):
         save_checkpoint(free, dataclasses.replace(checkpoint, step=9))
         assert load_checkpoint(free).step == 9
-
-
-def test_a_failed_write_keeps_the_old_checkpoint(copy, checkpoint, monkeypatch):
-    """The last file, the description, cannot be written."""
-    before = contents(copy.parent)
-    monkeypatch.setattr(json, "dumps", lambda *_, **__: (_ for _ in ()).throw(OSError("no")))
-    with pytest.raises(OSError, match="no"):
-        save_checkpoint(copy, checkpoint)
-    assert contents(copy.parent) == before
 
 
 @pytest.fixture

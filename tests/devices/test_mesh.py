@@ -42,14 +42,6 @@ def test_a_step_donates_replicated_copies_and_leaves_the_originals(mesh, convert
     np.testing.assert_array_equal(original["w"], tree()["w"])
 
 
-def test_a_sharded_batch_equals_the_batch(mesh):
-    batch = {"x": np.arange(12).reshape(4, 3), "valid": np.array([True, False, True, True])}
-    placed = shard_batch(batch, mesh)
-    for name, leaf in batch.items():
-        np.testing.assert_array_equal(placed[name], leaf)
-        assert placed[name].dtype == jnp.asarray(leaf).dtype
-
-
 def check_pmap_form(mesh) -> None:
     """Two steps of the pmap form equal two steps of the jit form."""
     rng = np.random.default_rng(0)

@@ -160,17 +160,6 @@ def test_the_owner_of_a_location_is_the_owner_of_its_first_round_point():
     assert sum(box >= 0 for box in expected) > 10
 
 
-def test_a_step_keeps_the_types_of_the_state_and_none_is_weak(trainer):
-    _, state, step, _ = trainer
-    after, _ = step(state, make_batch([frame(1)], **SIZES))
-
-    def kinds(tree):
-        return [jax.typeof(leaf) for leaf in jax.tree.leaves(tree)]
-
-    assert kinds(state) == kinds(after)
-    assert not any(getattr(kind, "weak_type", False) for kind in kinds(state))
-
-
 def test_schedules_have_the_end_points_of_the_paper():
     rate, momentum = (f(OptimizerConfig(), 5000) for f in (learning_rate_schedule, momentum_schedule))
     np.testing.assert_allclose([rate(0), rate(2000), rate(5000)], [1e-3, 1e-2, 1e-7], rtol=1e-4)
