@@ -15,15 +15,16 @@ from fcos_lidar_jax.fields import (
     BelowOne,
     Between,
     Bounds,
+    Checked,
     Count,
     Counts,
     Natural,
     Positive,
     Positives,
+    Range,
     Share,
     check,
     check_per_class,
-    check_types,
     from_json,
 )
 from fcos_lidar_jax.sensors import Sensor
@@ -32,7 +33,7 @@ MAX_ROUNDS = 100  # Each round is a pass over the points: far more rounds than e
 
 
 @dataclasses.dataclass(frozen=True)
-class CloudReading:
+class CloudReading(Checked):
     """How to read point clouds, in training, evaluation and detection; see :attr:`Config.reading`."""
 
     num_sweeps: Count = 1  # Maximum number of fused sweeps, including the current one.
@@ -41,16 +42,13 @@ class CloudReading:
     ones, or none."""
     close_m: Positive = 1.0  # Half the side of the square around the sensor that is cleared, metres.
 
-    def __post_init__(self) -> None:
-        check_types(self)
-
 
 WHOLE_SWEEP = CloudReading(remove_close="none")
 """The current sweep with every point."""
 
 
 @dataclasses.dataclass(frozen=True)
-class ProjectionConfig:
+class ProjectionConfig(Checked):
     """Points to range image (paper, sections 3.1 and 3.2)."""
 
     num_rounds: Annotated[int, Bounds(1, MAX_ROUNDS)] = 5  # Rounds of the multi-round projection.
@@ -61,12 +59,9 @@ class ProjectionConfig:
     close_m: Positive = CloudReading.close_m
     """Our choice: half the side of the square that ``remove_close`` clears, metres."""
 
-    def __post_init__(self) -> None:
-        check_types(self)
-
 
 @dataclasses.dataclass(frozen=True)
-class StemConfig:
+class StemConfig(Checked):
     """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
 
     groups: Literal["types", "modalities", "all"] = "types"
@@ -80,13 +75,13 @@ class StemConfig:
     """Our choice: one 1x1 merge per branch, or one shared by all branches."""
 
     def __post_init__(self) -> None:
-        check_types(self)
+        super().__post_init__()
         separable = self.group_rounds or self.groups == "types"
         check(separable, "group_rounds", self.group_rounds, "True unless groups is 'types'")
 
 
 @dataclasses.dataclass(frozen=True)
-class ModelConfig:
+class ModelConfig(Checked):
     """LiDAR-Net, feature pyramid and heads (paper, section 3.4)."""
 
     stem: StemConfig = StemConfig()  # Modality-wise convolutions.
@@ -123,19 +118,18 @@ class ModelConfig:
     """Our choice: scale of each channel, by which it is divided in preprocessing."""
 
     def __post_init__(self) -> None:
-        check_types(self)
+        super().__post_init__()
         with_local = self.local_geometry or not self.round_offsets
         check(with_local, "round_offsets", self.round_offsets, "False without local_geometry")
         groups = max(1, min(32, self.head_channels // 2))  # Groups of the group norms, see models.layers.
         check(self.head_channels % groups == 0, "head_channels", self.head_channels, f"a multiple of {groups}")
-        mean, scale = self.channel_mean, self.channel_scale
-        finite = all(map(math.isfinite, (*mean, *scale)))
-        check(finite and len(mean) >= 9, "channel_mean", mean, "nine or more finite numbers")
-        check(len(scale) == len(mean), "channel_scale", scale, f"{len(mean)} numbers, as many as channel_mean")
+        number, scales = len(self.channel_mean), self.channel_scale
+        expected = f"as many numbers as channel_mean ({number}), at least nine"
+        check(len(scales) == number >= 9, "channel_scale", scales, expected)
 
 
 @dataclasses.dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Checked):
     """Assignment and losses (paper, section 3.4)."""
 
     top_q: Count = 20  # Q: the dynamic K of a box is the rounded sum of its Q highest IoUs.
@@ -158,14 +152,14 @@ class LossConfig:
     centreness_m: Positive = 0.75  # Distance between the centres at which the centreness is 1 / e, metres.
 
     def __post_init__(self) -> None:
-        check_types(self)
+        super().__post_init__()
         width = self.centreness_m
         relevant = self.quality == "centreness" or width == LossConfig.centreness_m
         check(relevant, "centreness_m", width, f"{LossConfig.centreness_m} unless quality is centreness")
 
 
 @dataclasses.dataclass(frozen=True)
-class InferenceConfig:
+class InferenceConfig(Checked):
     """Predictions to detections (paper, section 3.4)."""
 
     min_probability: BelowOne = 0.01  # Minimum class probability of a candidate, before the IoU factor.
@@ -186,12 +180,9 @@ class InferenceConfig:
     """Not in the paper: test-time augmentation by mirrored clouds; "xy" adds all three. Only flips that were used
     in training are allowed."""
 
-    def __post_init__(self) -> None:
-        check_types(self)
-
 
 @dataclasses.dataclass(frozen=True)
-class RefinementConfig:
+class RefinementConfig(Checked):
     """A second look at the points of the best boxes (not in the paper), see :mod:`fcos_lidar_jax.refinement`."""
 
     num_boxes: Count = 200  # Best boxes of a cloud that are looked at; others are dropped.
@@ -203,7 +194,7 @@ class RefinementConfig:
     first_score_weight: Share = 0.0
     """Weight of the detector's score in the geometric mean with the second look's; 0 ignores it. The mean is
     more robust on data unlike the training's."""
-    radius_range_m: tuple[float, float] = (1.0, 2.0)
+    radius_range_m: Range = (1.0, 2.0)
     """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can
     stand for it."""
     between_weight: Share = 0.3
@@ -211,29 +202,19 @@ class RefinementConfig:
     freeze_detector: bool = False
     """Train only the second look; the detector is applied as in detection. For ``train --weights``."""
 
-    def __post_init__(self) -> None:
-        check_types(self)
-        low, high = self.radius_range_m
-        check(0 < low <= high < math.inf, "radius_range_m", self.radius_range_m, "(low, high), 0 < low <= high")
-
 
 @dataclasses.dataclass(frozen=True)
-class AugmentConfig:
+class AugmentConfig(Checked):
     """On-device augmentation of points and boxes (paper, section 4)."""
 
     flip_x_probability: Share = 0.5  # Our choice: probability of x -> -x.
     flip_y_probability: Share = 0.5  # Our choice: probability of y -> -y, independent of the flip of x.
     max_rotation_rad: Amount = math.pi  # The rotation about z is uniform between minus and plus this angle.
-    scale_range: tuple[float, float] = (0.95, 1.05)  # The scale is uniform in this range.
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        low, high = self.scale_range
-        check(0 < low <= high < math.inf, "scale_range", self.scale_range, "finite (low, high), 0 < low <= high")
+    scale_range: Range = (0.95, 1.05)  # The scale is uniform in this range.
 
 
 @dataclasses.dataclass(frozen=True)
-class CopyPasteConfig:
+class CopyPasteConfig(Checked):
     """Copy-paste of objects from other frames into a training frame (paper, section 4, after SECOND)."""
 
     targets: Annotated[tuple[int, ...], Bounds(0, empty=True)] = ()
@@ -241,12 +222,9 @@ class CopyPasteConfig:
     numbers of ``classes.PASTE_TARGETS``."""
     min_points: Count = 5  # Minimum number of points of an object, over all pasted sweeps.
 
-    def __post_init__(self) -> None:
-        check_types(self)
-
 
 @dataclasses.dataclass(frozen=True)
-class OptimizerConfig:
+class OptimizerConfig(Checked):
     """One-cycle AdamW (paper, section 4).
 
     >>> OptimizerConfig(batch_size=32, accumulate=3)
@@ -258,7 +236,7 @@ class OptimizerConfig:
     initial_divisor: Positive = 10.0  # The first learning rate is the peak divided by this.
     final_divisor: Positive = 1e4  # The learning rate falls towards the first divided by this.
     warmup_fraction: Between = 0.4  # Fraction of the steps that belong to the warm-up.
-    b1_range: tuple[float, float] = (0.85, 0.95)
+    b1_range: Annotated[tuple[float, float], Bounds(0, 1, above=True, below=True, ascending=True)] = (0.85, 0.95)
     """Momentum range: high at both ends, low at the peak of the learning rate; cosine (our choice)."""
     b2: BelowOne = 0.99  # Our choice: decay of the second moment.
     weight_decay: Amount = 0.01  # Applied to all parameters (our choice).
@@ -271,15 +249,13 @@ class OptimizerConfig:
     epochs: Count = 40  # Passes over the training set.
 
     def __post_init__(self) -> None:
-        check_types(self)
-        low, high = self.b1_range
-        check(0 < low <= high < 1, "b1_range", self.b1_range, "(low, high) with 0 < low <= high < 1")
+        super().__post_init__()
         divides = self.batch_size % self.accumulate == 0
         check(divides, "accumulate", self.accumulate, f"a divisor of the batch size {self.batch_size}")
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Checked):
     """Definition of an FCOS-LiDAR detector and its training, without the data.
 
     A subclass with additional fields defines and builds another detector, see ``fcos_lidar_jax.centerpoint``.
@@ -312,10 +288,10 @@ class Config:
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
 
     def __post_init__(self) -> None:
-        check_types(self)
+        super().__post_init__()
         names = self.classes
-        check(len(names) >= 1 and all(names), "classes", names, "one or more names")
-        check(len(set(names)) == len(names), "classes", names, "different names")
+        distinct = bool(names) and all(names) and len(set(names)) == len(names)
+        check(distinct, "classes", names, "one or more different names")
         stem, rounds = self.model.stem, self.projection.num_rounds
         enough = stem.group_rounds or stem.channels_per_type >= rounds
         expected = f"at least the {rounds} rounds, which are convolved separately"
@@ -403,7 +379,7 @@ def config_from_json(record: Any, where: str = "config") -> Config:
 
     >>> config_from_json({"name": "mine"}, "mine.json")
     Traceback (most recent call last):
-    ValueError: mine.json: sensor: missing, expected str
+    ValueError: mine.json: sensor: missing
     """
     kind = _kind_of(record) if isinstance(record, Mapping) else Config
     return from_json(kind, record, where)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -9,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """The numbers that a field accepts, declared by ``Annotated`` and checked by :func:`check_types`.
+    """The numbers that a field of a :class:`Checked` dataclass accepts, declared by ``Annotated``.
 
     They hold for each entry of a tuple, and for any value but None. Infinities are never accepted.
     """
@@ -19,15 +20,19 @@ class Bounds:
     above: bool = False  # without ``low`` itself
     below: bool = False  # without ``high`` itself
     empty: bool = False  # also an empty tuple
+    ascending: bool = False  # no entry is below the one before it
 
     def hold(self, value: Any) -> bool:
         numbers = value if isinstance(value, tuple) else (value,)
         low = all(number > self.low or (number == self.low and not self.above) for number in numbers)
         closed = not self.below and self.high < math.inf
         high = all(number < self.high or (number == self.high and closed) for number in numbers)
-        return low and high and (self.empty or len(numbers) > 0)
+        sorted_ = not self.ascending or all(a <= b for a, b in itertools.pairwise(numbers))
+        return low and high and sorted_ and (self.empty or len(numbers) > 0)
 
     def __str__(self) -> str:
+        if self.ascending:
+            return f"ascending numbers, each {dataclasses.replace(self, ascending=False)}"
         if self.high < math.inf:
             return f"within {'(' if self.above else '['}{self.low:g}, {self.high:g}{')' if self.below else ']'}"
         if isinstance(self.low, int):
@@ -44,6 +49,7 @@ Positives = Annotated[tuple[float, ...], Bounds(0.0, above=True)]
 Share = Annotated[float, Bounds(0, 1)]
 BelowOne = Annotated[float, Bounds(0, 1, below=True)]
 Between = Annotated[float, Bounds(0, 1, above=True, below=True)]  # 0 and 1
+Range = Annotated[tuple[float, float], Bounds(0.0, above=True, ascending=True)]
 
 
 def check(condition: bool, field: str, got: object, expected: str) -> None:
@@ -65,17 +71,19 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
     return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"
 
 
-def check_types(record: Any) -> None:
-    """Check that every field of a dataclass has its annotated type, length and :class:`Bounds`.
+class Checked:
+    """Base of frozen dataclasses whose fields must have their annotated type, length and :class:`Bounds`.
 
     Integers fit floats. Lists and arrays do not fit: compiled programs are looked up by the hash of options.
     """
-    for name, kind in get_type_hints(type(record), include_extras=True).items():
-        value, bounds = getattr(record, name), None
-        if get_origin(kind) is Annotated:
-            kind, bounds = get_args(kind)
-        check(_fits(kind, value), name, value, _expected(kind))
-        check(bounds is None or value is None or bounds.hold(value), name, value, str(bounds))
+
+    def __post_init__(self) -> None:
+        for name, kind in get_type_hints(type(self), include_extras=True).items():
+            value, bounds = getattr(self, name), None
+            if get_origin(kind) is Annotated:
+                kind, bounds = get_args(kind)
+            check(_fits(kind, value), name, value, _expected(kind))
+            check(bounds is None or value is None or bounds.hold(value), name, value, str(bounds))
 
 
 def _fits(kind: Any, value: Any) -> bool:
@@ -99,7 +107,9 @@ def _expected(kind: Any) -> str:
     if origin is tuple:
         number = "" if args[-1] is Ellipsis else f"{len(args)} "
         return f"a tuple of {number}{args[0].__name__}"
-    return " or ".join("None" if each is type(None) else each.__name__ for each in args or (kind,))
+    if args:  # AugmentConfig | None
+        return " or ".join(map(_expected, args))
+    return "None" if kind is type(None) else kind.__name__
 
 
 def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> Any:
@@ -122,19 +132,14 @@ def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> A
         return _dataclass_from_json(kind, value, where, defaults)
     origin, args = get_origin(kind), get_args(kind)
     if origin is Literal:
-        return value  # Checked by the dataclass, see check_types.
+        return value  # Checked by the dataclass, like the length of a tuple.
     if origin is tuple:
         check(isinstance(value, list | tuple), where, value, "a list")
-        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
-        if len(kinds) != len(value):
-            raise ValueError(f"{where}: got {len(value)} values, expected {len(kinds)}")
-        return tuple(from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+        return tuple(from_json(args[0], entry, f"{where}[{i}]") for i, entry in enumerate(value))
     if args:  # AugmentConfig | None
         return None if value is None else from_json(args[0], value, where)
-    accepted = int | float if kind is float else kind
-    fits = kind is not float or (isinstance(value, int | float) and not 1e300 < abs(value) < math.inf)
-    fits = fits and isinstance(value, accepted) and (kind is bool or not isinstance(value, bool))
-    check(fits, where, value, kind.__name__)
+    too_large = isinstance(value, int) and abs(value) > 1e300  # for a float
+    check(_fits(kind, value) and not too_large, where, value, kind.__name__)
     return kind(value)
 
 
@@ -147,18 +152,12 @@ def _dataclass_from_json(kind: Any, value: Any, where: str, defaults: bool) -> A
             raise ValueError(f"{_place(where, name)}: unknown field, expected one of {', '.join(hints)}")
     for field in dataclasses.fields(kind):
         if field.name not in value and not (defaults and field.default is not dataclasses.MISSING):
-            raise ValueError(f"{_place(where, field.name)}: missing, expected {_described(hints[field.name])}")
+            raise ValueError(f"{_place(where, field.name)}: missing")
     fields = {name: from_json(hints[name], entry, _place(where, name)) for name, entry in value.items()}
     try:
         return kind(**fields)
     except ValueError as error:
         raise ValueError(_place(where, str(error))) from None
-
-
-def _described(kind: Any) -> str:
-    if dataclasses.is_dataclass(kind):
-        return "a JSON object"
-    return "a list" if get_origin(kind) is tuple else getattr(kind, "__name__", "a value")
 
 
 def _place(where: str, field: str) -> str:

@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from fcos_lidar_jax.fields import Bounds, check, check_types, from_json, unknown_name
+from fcos_lidar_jax.fields import Bounds, Checked, check, from_json, unknown_name
 from fcos_lidar_jax.files import read_json
 
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
@@ -20,7 +21,7 @@ _Positive = Annotated[float, Bounds(0.0, _MAX_NUMBER, above=True)]
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensor:
+class Sensor(Checked):
     """A rotating LiDAR, described as far as the range view needs it (paper, section 3.1).
 
     Raises:
@@ -52,11 +53,11 @@ class Sensor:
     pi/2 where y points forward. None if unknown; clouds are then never rotated."""
 
     def __post_init__(self) -> None:
-        check_types(self)
-        table, ends = np.asarray(self.inclinations_rad, np.float64), self.azimuth_limits_rad
-        check(2 <= table.size <= _MAX_ROWS, "inclinations_rad", f"{table.size} beams", f"2 to {_MAX_ROWS}")
-        if not (np.diff(table) < 0).all():
-            raise ValueError("inclinations_rad: expected strictly decreasing values, the highest beam first")
+        super().__post_init__()
+        table, ends = self.inclinations_rad, self.azimuth_limits_rad
+        decreasing = 2 <= len(table) <= _MAX_ROWS and all(above > below for above, below in pairwise(table))
+        expected = f"2 to {_MAX_ROWS} strictly decreasing values, the highest beam first"
+        check(decreasing, "inclinations_rad", table, expected)
         check(self.limit_z_m[0] < self.limit_z_m[1], "limit_z_m", self.limit_z_m, "(low, high) with low < high")
         if ends is not None:
             within = abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
@@ -231,23 +232,13 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     return dataclasses.asdict(sensor)
 
 
-def _usual_heading(name: object) -> float | None:
-    """Heading of a sensor without the field: the heading of the preset with its name."""
-    preset = PRESETS.get(name) if isinstance(name, str) else None
-    return None if preset is None else preset.forward_rad
-
-
 @dataclasses.dataclass(frozen=True)
-class _EvenBeams:
+class _EvenBeams(Checked):
     """Evenly spaced beams, in degrees, of a sensor file."""
 
     lowest: Annotated[float, _Place]
     highest: Annotated[float, _Place]
     rows: Annotated[int, Bounds(2, _MAX_ROWS)]
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        check(self.lowest < self.highest, "highest", self.highest, f"more than the lowest beam, {self.lowest:g}")
 
 
 def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
@@ -266,22 +257,19 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     """
     if not isinstance(record, dict):
         return from_json(Sensor, record, where)  # refused
-    known = ("inclinations_deg", *(field.name for field in dataclasses.fields(Sensor)))
-    if unknown := [name for name in record if name not in known]:
-        raise ValueError(f"{where}: {unknown[0]}: unknown field, expected one of {', '.join(known)}")
     if ("inclinations_deg" in record) == ("inclinations_rad" in record):
         found = "both" if "inclinations_deg" in record else "missing"
         raise ValueError(f"{where}: inclinations_deg, inclinations_rad: {found}, expected one of them")
-    record = {"forward_rad": _usual_heading(record.get("name")), **record}
+    preset = PRESETS.get(str(record.get("name")))
+    record = {"forward_rad": None if preset is None else preset.forward_rad, **record}
     if "inclinations_deg" in record:
-        kind = tuple[float, ...] if isinstance(record["inclinations_deg"], list) else _EvenBeams
-        beams = from_json(kind, record["inclinations_deg"], f"{where}: inclinations_deg")
+        given = record.pop("inclinations_deg")
+        kind = tuple[float, ...] if isinstance(given, list) else _EvenBeams
+        beams = from_json(kind, given, f"{where}: inclinations_deg")
         if isinstance(beams, _EvenBeams):
-            table = even_inclinations(beams.lowest, beams.highest, beams.rows)
+            record["inclinations_rad"] = even_inclinations(beams.lowest, beams.highest, beams.rows)
         else:
-            table = tuple(math.radians(beam) for beam in beams)
-        others = {name: value for name, value in record.items() if name != "inclinations_deg"}
-        record = {**others, "inclinations_rad": table}
+            record["inclinations_rad"] = tuple(math.radians(beam) for beam in beams)
     return from_json(Sensor, record, where, defaults=True)
 
 

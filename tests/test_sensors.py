@@ -25,8 +25,7 @@ def test_presets_match_the_paper_and_the_data_sheets():
     assert (nuscenes.num_rows, nuscenes.num_columns) == (32, 1086)
     degrees = np.degrees(nuscenes.inclinations_rad)
     np.testing.assert_allclose(degrees, 10.67 - np.arange(32) * (10.67 + 30.67) / 31, atol=1e-9)
-    assert PRESETS["waymo_top"].num_rows == 64
-    assert PRESETS["waymo_top"].num_columns == 2650
+    assert (PRESETS["waymo_top"].num_rows, PRESETS["waymo_top"].num_columns) == (64, 2650)
     assert PRESETS["kitti_hdl64e"].num_rows == PRESETS["argoverse2"].num_rows == 64
     assert PRESETS["argoverse2"].point_columns == 6
     assert nuscenes.even_step_rad is not None
@@ -71,17 +70,14 @@ def test_sensors_survive_a_round_trip_through_files(tmp_path, name):
     assert load_sensor(path) == PRESETS[name] == load_sensor(name)
 
 
-@pytest.mark.parametrize("middle", [math.pi / 2, -math.pi, 3.0, 7.0])
-def test_a_sector_keeps_the_column_width_and_survives_a_round_trip(tmp_path, middle):
+@pytest.mark.parametrize("middle", [math.pi / 2, -math.pi, 7.0])
+def test_a_sector_keeps_the_column_width(middle):
     part = sector(TINY, middle, 64)
     right, left = part.azimuth_limits_rad
     assert math.remainder((left + right) / 2 - middle, 2 * math.pi) == pytest.approx(0, abs=1e-12)
     assert left - right == pytest.approx(math.pi / 2)
     assert part.column_rad == pytest.approx(TINY.column_rad) == pytest.approx(2 * math.pi / 256)
     assert (part.first_azimuth_rad, TINY.first_azimuth_rad) == (left, math.pi)
-    path = tmp_path / "sensor.json"
-    path.write_text(json.dumps(sensor_to_json(part)))
-    assert load_sensor(path) == part
 
 
 def test_the_heading_of_files_without_it_is_that_of_the_preset_of_the_same_name():
@@ -119,66 +115,41 @@ def test_an_image_in_another_frame_has_the_same_cells():
     assert 100 < (cells < 1600).sum() < 1500
 
 
-def test_evenly_spaced_beams_can_be_given_in_degrees():
-    beams = {"lowest": -25, "highest": 3, "rows": 64}
+@pytest.mark.parametrize("beams", [{"lowest": -25, "highest": 3, "rows": 3}, [3, -11, -25]])
+def test_beams_can_be_given_in_degrees(beams):
     sensor = sensor_from_json({"name": "a", "num_columns": 1024, "inclinations_deg": beams})
-    assert math.degrees(sensor.inclinations_rad[0]) == pytest.approx(3)
-    assert math.degrees(sensor.inclinations_rad[-1]) == pytest.approx(-25)
-
-
-def test_beams_can_be_listed_in_degrees():
-    sensor = sensor_from_json({"name": "a", "num_columns": 1024, "inclinations_deg": [10, 0.5, -25]})
-    np.testing.assert_allclose(sensor.inclinations_rad, np.deg2rad([10, 0.5, -25]))
+    np.testing.assert_allclose(sensor.inclinations_rad, np.deg2rad([3, -11, -25]))
 
 
 GOOD = {"name": "a", "num_columns": 8, "inclinations_rad": [0.1, 0.0]}
 BEAMLESS = {"name": "a", "num_columns": 8}
 BAD = [
     ([1], "got list, expected a JSON object"),
-    (
-        {**GOOD, "colour": 1},
-        "colour: unknown field, expected one of inclinations_deg, name, inclinations_rad, num_c",
-    ),
+    ({**GOOD, "colour": 1}, "colour: unknown field, expected one of name, inclinations_rad, num_columns"),
     (BEAMLESS, "inclinations_deg, inclinations_rad: missing, expected one of them"),
     ({**GOOD, "inclinations_deg": {}}, "inclinations_deg, inclinations_rad: both, expected one of them"),
     ({**GOOD, "num_columns": "many"}, "num_columns: got 'many'"),
-    ({**GOOD, "num_columns": 1}, "num_columns: got 1"),
-    ({**GOOD, "num_columns": True}, "num_columns: got True"),
     ({**GOOD, "num_columns": 100_000_000}, "num_columns: got 100000000, expected within"),
-    ({**GOOD, "inclinations_rad": [-i / 1e4 for i in range(5000)]}, "got '5000 beams', expected 2 to 4096"),
-    ({**GOOD, "inclinations_rad": [0.0, 0.1]}, "strictly decreasing"),
-    ({**GOOD, "inclinations_rad": [0.1]}, "got '1 beams'"),
+    ({**GOOD, "inclinations_rad": [-i / 1e4 for i in range(5000)]}, "expected 2 to 4096 strictly decreasing"),
+    ({**GOOD, "inclinations_rad": [0.0, 0.1]}, "expected 2 to 4096 strictly decreasing values, the highest"),
     ({**GOOD, "inclinations_rad": [3.0, 0.0]}, "within"),
     ({**GOOD, "inclinations_rad": "0.1 0.0"}, "expected a list"),
     ({**GOOD, "inclinations_rad": [None, 0.0]}, r"inclinations_rad\[0\]: got None, expected float"),
     ({**BEAMLESS, "inclinations_deg": {"lowest": 1}}, "inclinations_deg.highest: missing"),
-    ({**BEAMLESS, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 1}}, "rows: got 1"),
     ({**BEAMLESS, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 2**32}}, "rows: got 4294967296"),
-    (
-        {**BEAMLESS, "inclinations_deg": {"lowest": 5, "highest": -5, "rows": 2}},
-        "inclinations_deg.*highest: got -5.0, expected more than the lowest beam, 5",
-    ),
+    ({**BEAMLESS, "inclinations_deg": {"lowest": 5, "highest": -5, "rows": 2}}, "inclinations_rad: .* decreasing"),
     ({**BEAMLESS, "inclinations_deg": [1, "2"]}, r"inclinations_deg\[1\]: got '2', expected float"),
-    ({**GOOD, "azimuth_limits_rad": 1}, "azimuth_limits_rad: got 1, expected a list"),
-    ({**GOOD, "azimuth_limits_rad": [1]}, "azimuth_limits_rad: got 1 values, expected 2"),
-    ({**GOOD, "azimuth_limits_rad": [1, 1]}, r"azimuth_limits_rad: got \(1\.0, 1\.0\), expected \(right, left\)"),
-    ({**GOOD, "azimuth_limits_rad": [4, 5]}, r"azimuth_limits_rad: got \(4\.0, 5\.0\), expected \(right, left\)"),
     (
-        {**GOOD, "azimuth_limits_rad": [-3, 4]},
-        r"azimuth_limits_rad: got \(-3\.0, 4\.0\), expected \(right, ",
+        {**GOOD, "azimuth_limits_rad": [1]},
+        "azimuth_limits_rad: got .*, expected a tuple of 2 float or None",
     ),
-    ({**GOOD, "limit_xy_m": 10**400}, "limit_xy_m: got 10000"),
+    ({**GOOD, "azimuth_limits_rad": [1, 1]}, r"azimuth_limits_rad: got \(1\.0, 1\.0\), expected \(right, left\)"),
+    ({**GOOD, "azimuth_limits_rad": [-3, 4]}, r"azimuth_limits_rad: got \(-3\.0, 4\.0\), expected \(right, "),
     ({**GOOD, "limit_xy_m": 1e31}, "limit_xy_m: got 1e"),
     ({**GOOD, "limit_xy_m": math.nan}, "limit_xy_m: got nan"),
-    ({**GOOD, "limit_z_m": [0, math.inf]}, "limit_z_m: got .*expected within"),
-    ({**BEAMLESS, "inclinations_deg": {"lowest": -math.inf, "highest": 1, "rows": 2}}, "lowest: got -inf"),
-    ({**GOOD, "origin_m": [1, 2]}, "origin_m"),
-    ({**GOOD, "limit_xy_m": -1}, "limit_xy_m: got -1"),
     ({**GOOD, "limit_z_m": [3, 1]}, "limit_z_m"),
-    ({**GOOD, "intensity_scale": 0}, "intensity_scale: got 0"),
     ({**GOOD, "forward_rad": 90}, "forward_rad: got 90.0, expected within"),
     ({**GOOD, "row_source": "ring"}, "row_source: got 'ring'"),
-    ({**GOOD, "name": 3}, "name: got 3"),
 ]
 
 
@@ -207,9 +178,3 @@ def test_a_file_may_hold_the_name_of_a_preset(tmp_path):
     (tmp_path / "sensor.json").write_text('"tinny"')
     with pytest.raises(ValueError, match=r"sensor\.json: got 'tinny', expected tiny$"):
         load_sensor(tmp_path / "sensor.json")
-
-
-@pytest.mark.parametrize("field", ["inclinations_rad", "origin_m", "limit_z_m"])
-def test_lists_are_rejected_because_sensors_are_hashed(field):
-    with pytest.raises(ValueError, match=rf"{field}: got \[.*\], expected a tuple"):
-        dataclasses.replace(TINY, **{field: list(getattr(TINY, field))})

@@ -3,11 +3,11 @@
 import dataclasses
 from typing import Annotated, Literal
 
-from fcos_lidar_jax.fields import Between, Bounds, Count, Positive, check, check_types
+from fcos_lidar_jax.fields import Between, Bounds, Checked, Count, Positive, check
 
 
 @dataclasses.dataclass(frozen=True)
-class PillarConfig:
+class PillarConfig(Checked):
     """Pillars, network and targets, by default with the authors' values for nuScenes.
 
     >>> PillarConfig(range_m=50.0)
@@ -31,7 +31,7 @@ class PillarConfig:
     centre_prior: Between = 0.1  # Initial probability of a centre.
 
     def __post_init__(self) -> None:
-        check_types(self)
+        super().__post_init__()
         check(self.pillar_m < self.range_m, "pillar_m", self.pillar_m, f"between 0 and {self.range_m} m")
         side = 2 * self.range_m / self.pillar_m
         whole = abs(side - round(side)) < 1e-3 and round(side) % 8 == 0

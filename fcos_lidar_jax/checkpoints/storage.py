@@ -117,8 +117,14 @@ def _check_replaceable(folder: Path) -> None:
     """Refuse to replace anything but a checkpoint. The folder of a run can be read as one, but not replaced."""
     if is_checkpoint(folder) or not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return
-    found = f"a folder without {_DESCRIPTION}" if folder.is_dir() else "a file"
-    raise CheckpointError(f"{folder}: found {found}, expected a checkpoint to replace, or nothing")
+    raise CheckpointError(f"{folder}: found {_found(folder)}, expected a checkpoint to replace, or nothing")
+
+
+def _found(folder: Path) -> str:
+    """What is in the place of a checkpoint."""
+    if folder.is_dir():
+        return f"a folder without {_DESCRIPTION}"
+    return "a file" if os.path.lexists(folder) else "nothing"
 
 
 def _replace_folder(beside: Path, folder: Path) -> None:
@@ -143,8 +149,7 @@ def is_checkpoint(folder: Path) -> bool:
 def save_score(folder: str | Path, score: float) -> None:
     """Record the score of a checkpoint without touching its arrays."""
     file = Path(folder).absolute() / _DESCRIPTION
-    read_description(file.parent)
-    text = _with_hash(read_json(file, dict[str, Any]) | {"score": score})
+    text = _with_hash(read_description(file.parent) | {"score": score})
     # Written beside the checkpoint: a file that a kill leaves in it would count as damage.
     with naming(file), tempfile.TemporaryDirectory(prefix=f".{file.parent.name}.", dir=file.parents[1]) as beside:
         new = Path(beside) / _DESCRIPTION
@@ -261,42 +266,32 @@ def _hashes(folder: Path) -> dict[str, str]:
 
 def verify(folder: Path) -> dict[str, Any]:
     """Check the hashes of all files of a checkpoint, and return its description."""
-    if not folder.is_dir():
-        if folder.exists():
-            raise CheckpointError(f"{folder}: found a file, expected a checkpoint folder")
-        names = ", ".join(shipped_checkpoints())
-        places = f"a checkpoint folder, the folder of a run, or the name of shipped weights: {names}"
-        raise CheckpointError(f"{folder}: found nothing, expected {places}")
     description = read_description(folder)
-    expected, hashes = description["files"], _hashes(folder)
-    for name in sorted(expected.keys() | hashes.keys()):
-        if name not in hashes:
-            raise CheckpointError(f"{folder / name}: found nothing, expected a file of the checkpoint")
-        if name not in expected:
-            raise CheckpointError(f"{folder / name}: found a file that does not belong to the checkpoint")
-        if expected[name] != hashes[name]:
-            raise CheckpointError(f"{folder / name}: hash {hashes[name]}, expected {expected[name]}: damaged")
+    expected, found = description["files"], _hashes(folder)
+    for name in sorted(expected.keys() | found.keys()):
+        was, now = (f"hash {files[name]}" if name in files else "no file" for files in (expected, found))
+        if was != now:
+            raise CheckpointError(f"{folder / name}: damaged: got {now}, expected {was}")
     return description
 
 
 def read_description(folder: Path) -> dict[str, Any]:
     """Read and check the description of a checkpoint, but not its arrays."""
     file = folder / _DESCRIPTION
-    if not file.is_file():
-        places = "a checkpoint folder, or the folder of a run that has saved one"
-        raise CheckpointError(f"{folder}: no {_DESCRIPTION} in it, expected {places}")
+    if not is_checkpoint(folder):
+        places = "a checkpoint folder, the folder of a run that has saved one, or the name of shipped weights"
+        names = ", ".join(shipped_checkpoints())
+        raise CheckpointError(f"{folder}: found {_found(folder)}, expected {places}: {names}")
     try:
-        description = read_json(file)
+        description = read_json(file, dict[str, Any])
     except ValueError as error:
         raise CheckpointError(str(error)) from None
-    if not isinstance(description, dict) or description.get("format") != _FORMAT:
-        version = description.get("format") if isinstance(description, dict) else type(description).__name__
+    if (version := description.get("format")) != _FORMAT:
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
-    if description.get("hash") != checksum(_canonical(description)):
+    kinds = {"step": int, "config": dict, "sensor": dict, "files": dict}
+    whole = all(isinstance(description.get(name), kind) for name, kind in kinds.items())
+    if not whole or description.get("hash") != checksum(_canonical(description)):
         raise CheckpointError(f"{file}: damaged: its hash does not match its content")
-    for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
-        if not isinstance(description.get(name), kind):
-            raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
     return {**description, "config": with_later_fields(description["config"])}
 
 

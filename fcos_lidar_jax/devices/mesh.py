@@ -49,21 +49,8 @@ def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
     Raises:
         ValueError: the devices of this process cannot share the rows evenly.
     """
-    sharding, number = NamedSharding(mesh, PartitionSpec(_AXIS)), len(mesh.local_devices)
-
-    def place(leaf: Any) -> jax.Array:
-        rows = np.asarray(leaf)
-        if number and len(rows) % number:
-            raise ValueError(f"batch: got {len(rows)} rows, expected a multiple of the {number} devices")
-        return jax.make_array_from_process_local_data(sharding, rows)
-
-    return jax.tree.map(place, batch)
-
-
-def check_batch_size(batch_size: int, mesh: Mesh) -> None:
-    """Raise a ValueError if the devices cannot share a global batch evenly."""
-    if batch_size % mesh.size:
-        raise ValueError(f"batch_size: got {batch_size}, expected a multiple of the {mesh.size} devices")
+    sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), batch)
 
 
 def jit_step(step: Step, mesh: Mesh) -> Step:

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,7 @@ from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.point_files import check_num_lags
-from fcos_lidar_jax.devices.mesh import check_batch_size
-from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.fields import Bounds, Checked, Count, check
 from fcos_lidar_jax.files import local_path, read_json
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts, spread_indices
@@ -48,7 +47,7 @@ Hook = Callable[[int, Record], None]
 
 
 @dataclasses.dataclass(frozen=True)
-class Schedule:
+class Schedule(Checked):
     """Steps of a run at which it saves checkpoints and evaluates.
 
     Attributes:
@@ -58,15 +57,9 @@ class Schedule:
         keep: number of newest checkpoints to keep, in addition to the best.
     """
 
-    save_every: int | None = None
-    evaluate_every: int | None = None
-    keep: int = 2
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            known = value is None or (type(value) is int and value >= 1)
-            check(known, f"schedule.{field.name}", value, "an integer of at least 1")
+    save_every: Annotated[int | None, Bounds(1)] = None
+    evaluate_every: Annotated[int | None, Bounds(1)] = None
+    keep: Count = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,8 +104,6 @@ class RunSpec:
 
     def __post_init__(self) -> None:
         config, steps, seed = self.config, self.steps, self.seed
-        check(isinstance(config, Config), "config", config, "a Config, such as presets.COMPACT")
-        check(isinstance(self.schedule, Schedule), "schedule", self.schedule, "a Schedule")
         check(type(steps) is int and 1 <= steps < 2**31, "steps", steps, f"an integer from 1 to {2**31 - 1}")
         check(type(seed) is int and 0 <= seed < NUM_SEEDS, "seed", seed, f"an integer from 0 to {NUM_SEEDS - 1}")
         object.__setattr__(self, "out", local_path(self.out))
@@ -156,7 +147,8 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     check_counts(frames)
     for read in filter(None, (frames, spec.tests)):
         read.check_files(range(len(read)))
-    check_batch_size(config.optimizer.batch_size, mesh)
+    size, number = config.optimizer.batch_size, mesh.size
+    check(size % number == 0, "batch_size", size, f"a multiple of the {number} devices")
     options = {"threads": spec.threads, "workers": spec.workers, "num_processes": jax.process_count()}
     check_loader_options(config, **options)
     if config.copy_paste is not None:
@@ -232,15 +224,15 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     """
     folder = local_path(folder)
     file = folder / RUN_SPEC
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder}: found a file, expected a folder")
     if not file.is_file():
         if resume:
             raise ValueError(f"{file}: found nothing, expected the run to resume")
-        if saved := Checkpoints(folder / CHECKPOINTS).paths():  # a new run would remove them
-            raise ValueError(f"{saved[-1]}: found a checkpoint without {RUN_SPEC}, expected another folder")
-        if (metrics := folder / METRICS).exists() and metrics.stat().st_size:  # a new run would empty it
-            raise ValueError(f"{metrics}: found metrics without {RUN_SPEC}, expected another folder")
+        results = [
+            *Checkpoints(folder / CHECKPOINTS).paths(),
+            *folder.glob(METRICS),
+        ]  # a new run would remove them
+        if results:
+            raise ValueError(f"{results[-1]}: found without {RUN_SPEC}, expected another folder")
         return
     if not resume:
         raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")

@@ -14,7 +14,6 @@ from jaxtyping import Array
 
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
-from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.refinement import trainable
 from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
@@ -38,7 +37,6 @@ def make_state(
         key: random key of the run.
         variables: initial ``params`` and ``batch_stats``; random by default.
     """
-    check(not isinstance(key, int), "key", key, f"a random key, such as jax.random.key({key})")
     variables = detector.init(key) if variables is None else variables
     state = TrainState(
         step=jnp.zeros((), jnp.int32),

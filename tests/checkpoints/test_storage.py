@@ -87,12 +87,11 @@ def test_a_round_trip_is_bit_identical(written, checkpoint, state):
     assert written.stat().st_mode & 0o777 == 0o755
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_not_finite_are_never_saved(copy, checkpoint, value):
+def test_values_that_are_not_finite_are_never_saved(copy, checkpoint):
     before = contents(copy.parent)
     variables = jax.tree.map(np.array, checkpoint.variables)
     for leaf in jax.tree.leaves(variables["batch_stats"]):
-        leaf.flat[0] = value
+        leaf.flat[0] = np.inf
     with pytest.raises(NonFiniteStateError, match=r"c: not saved: variables/batch_stats/.*: not finite"):
         save_checkpoint(copy, dataclasses.replace(checkpoint, variables=variables))
     assert contents(copy.parent) == before
@@ -134,55 +133,44 @@ def flip(file: Path) -> None:
     file.write_bytes(content)
 
 
-@pytest.mark.parametrize(
-    ("part", "damage"), [("variables", truncate), ("state", flip), ("variables", Path.unlink)]
-)
-def test_a_corrupt_array_file_is_named(copy, state, part, damage):
-    largest = max((p for p in (copy / part).rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
-    damage(largest)
-    message = "found nothing, expected a file" if damage is Path.unlink else "hash .*: damaged"
+DAMAGES = {  # what happens to a file, and the message
+    "cut": (truncate, "got hash .*, expected hash"),
+    "one bit": (flip, "got hash .*, expected hash"),
+    "missing": (Path.unlink, "got no file, expected hash"),
+    "additional": (
+        lambda file: file.with_name(f"{file.name}.new").write_text("x"),
+        "got hash .*, expected no file",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_named(copy, state, damage):
+    change, message = DAMAGES[damage]
+    largest = max((p for p in (copy / "state").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    change(largest)
     for load in (load_checkpoint, lambda folder: load_state(folder, state)):
-        with pytest.raises(CheckpointError, match=rf"^{re.escape(str(largest))}: {message}"):
+        with pytest.raises(CheckpointError, match=rf"^{re.escape(str(largest))}(\.new)?: damaged: {message}"):
             load(copy)
 
 
-def test_corruption_of_any_file_is_detected(written, tmp_path):
-    names = [p.relative_to(written) for p in sorted(written.rglob("*")) if p.is_file()]
-    for number, name in enumerate(names):
-        folder = shutil.copytree(written, tmp_path / str(number))
-        truncate(folder / name) if (folder / name).stat().st_size else (folder / name).write_text("x")
-        with pytest.raises(CheckpointError, match=name.name):
-            load_checkpoint(folder)
-
-
-def means_the_same(a, b):
-    try:
-        return json.loads(a) == json.loads(b)
-    except ValueError:
-        return False
-
-
-def test_a_flipped_bit_in_the_description_is_detected(copy, written):
-    """Unless the JSON is equal, as between tokens or in a last digit that is rounded away."""
-    content = (written / "checkpoint.json").read_bytes()
-    for at in np.random.default_rng(0).choice(len(content), 200, replace=False):
-        changed = bytearray(content)
-        changed[at] ^= 1
-        if means_the_same(changed, content):
-            continue
-        (copy / "checkpoint.json").write_bytes(changed)
-        with pytest.raises(CheckpointError, match=r"checkpoint\.json"):
+def test_corruption_of_any_file_is_detected(copy):
+    for file in [file for file in copy.rglob("*") if file.is_file()]:
+        content = file.read_bytes()
+        file.write_bytes(content[1:] if content else b"x")
+        with pytest.raises(CheckpointError, match=file.name):
             load_checkpoint(copy)
+        file.write_bytes(content)
+    assert load_checkpoint(copy).step == 7
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[]", "format: got 'list', expected 3"),
-        ("{}", "format: got None, expected 3"),
+        ("[]", r"checkpoint\.json: \$: got \[\], expected object"),
         ('{"format": 2}', r"checkpoint\.json: format: got 2, expected 3$"),
         ("", "not JSON"),
-        (None, r"no checkpoint\.json in it"),
+        (None, r"found a folder without checkpoint\.json, expected a checkpoint folder"),
     ],
 )
 def test_an_invalid_description_is_named(tmp_path, text, message):
@@ -190,13 +178,6 @@ def test_an_invalid_description_is_named(tmp_path, text, message):
         (tmp_path / "checkpoint.json").write_text(text)
     with pytest.raises(CheckpointError, match=message):
         load_checkpoint(tmp_path)
-
-
-def test_an_additional_file_is_named(copy):
-    (copy / "variables" / "stranger").write_text("x")
-    message = r"variables/stranger: found a file that does not belong to the checkpoint"
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint(copy)
 
 
 def test_a_checkpoint_without_a_state_cannot_be_resumed(tmp_path, checkpoint, state):
@@ -218,36 +199,22 @@ def test_arrays_of_another_configuration_are_refused(tmp_path, written, checkpoi
         load_state(written, dataclasses.replace(state, ema=None))
 
 
-def test_a_missing_parent_folder_is_named(tmp_path, checkpoint):
-    with pytest.raises(OSError, match="gone"):
-        save_checkpoint(tmp_path / "gone" / "c", checkpoint)
-
-
-@pytest.mark.parametrize("target", ["run", "run/notes.txt"])
-def test_only_a_checkpoint_is_replaced(copy, checkpoint, target):
+def test_only_a_checkpoint_is_replaced(copy, checkpoint):
     """A run stands for its last checkpoint when it is read, but writing there would delete the run."""
     run = copy.parent / "run"
     (run / "checkpoints").mkdir(parents=True)
     (run / "notes.txt").write_text("mine")
     before = contents(copy.parent)
-    with pytest.raises(
-        CheckpointError, match=rf"{target}: found a .*, expected a checkpoint to replace, or nothing"
-    ):
-        save_checkpoint(copy.parent / target, checkpoint)
+    for target, found in ((run, "a folder without checkpoint.json"), (run / "notes.txt", "a file")):
+        with pytest.raises(
+            CheckpointError, match=f"{target}: found {found}, expected a checkpoint to replace, or"
+        ):
+            save_checkpoint(target, checkpoint)
     assert contents(copy.parent) == before
     (copy.parent / "empty").mkdir()
-    for free in (copy, copy.parent / "empty", copy.parent / "new"):
+    for free in (copy, copy.parent / "empty"):
         save_checkpoint(free, dataclasses.replace(checkpoint, step=9))
         assert load_checkpoint(free).step == 9
-
-
-def test_a_failed_write_keeps_the_old_checkpoint(copy, checkpoint, monkeypatch):
-    """The last file, the description, cannot be written."""
-    before = contents(copy.parent)
-    monkeypatch.setattr(json, "dumps", lambda *_, **__: (_ for _ in ()).throw(OSError("no")))
-    with pytest.raises(OSError, match="no"):
-        save_checkpoint(copy, checkpoint)
-    assert contents(copy.parent) == before
 
 
 @pytest.fixture

@@ -211,9 +211,9 @@ def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, 
 BAD = mistakes(r"""
 --steps 0 => steps: got 0, expected an integer from 1 to 2147483647
 --steps 3000000000 => steps: got 3000000000, expected an integer from 1
---save-every 0 => schedule.save_every: got 0
---evaluate-every -1 => schedule.evaluate_every: got -1
---keep 0 => schedule.keep: got 0
+--save-every 0 => save_every: got 0
+--evaluate-every -1 => evaluate_every: got -1
+--keep 0 => keep: got 0
 --threads -1 => threads: got -1, expected at least 0
 --workers -1 => workers: got -1
 --samples 0:1 --workers -1 => workers: got -1

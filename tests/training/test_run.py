@@ -10,32 +10,34 @@ import io
 import json
 import os
 import re
+import resource
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 from unittest.mock import Mock
 
 import jax
 import numpy as np
 import pytest
-from commands import run_python
 from event_files import summaries
 from linear_network import linear_network
 from PIL import Image
 from tiny_run import CONFIG, FRAMES, SENSOR, STEPS, TESTS, bits, train_tiny, weights
 
-from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, load_state, save_checkpoint
+from fcos_lidar_jax.checkpoints import load_checkpoint, load_state
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.input_pipeline import loader
-from fcos_lidar_jax.input_pipeline.database import prepare_database
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.training import NonFiniteLossError, plan
+from fcos_lidar_jax.training import plan
 from fcos_lidar_jax.training import run as runs
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.types import HostBatch
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,10 +63,11 @@ def traces():
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, traces):
-    """An uninterrupted run: its folder, its last state, and the number of traces of its step."""
-    folder = tmp_path_factory.mktemp("finished") / "run"
-    state = train_tiny(folder, evaluate=2, tests=TESTS, weights=weights())
-    return folder, state, len(traces)
+    """An uninterrupted run: its folder, last state, number of traces of its step, and calls of its hook."""
+    folder, calls = tmp_path_factory.mktemp("finished") / "run", []
+    options = {"evaluate": 2, "tests": TESTS, "weights": weights()}
+    state = train_tiny(folder, **options, hooks=[lambda *call: calls.append(call)])
+    return folder, state, len(traces), calls
 
 
 @pytest.fixture
@@ -81,7 +84,7 @@ def scores(folder: Path) -> dict[int, float]:
 
 
 def checkpoint_names(folder: Path) -> list[str]:
-    return sorted(path.name for path in (folder / "checkpoints").iterdir())
+    return sorted(path.name for path in (folder / "checkpoints").glob("*"))
 
 
 def contents(folder: Path) -> dict[Path, bytes]:
@@ -89,33 +92,26 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def test_a_step_is_compiled_once(finished):
-    _, state, traces = finished
+    _, state, traces, _ = finished
     assert int(state.step) == STEPS
     assert traces == 1
 
 
-def test_initial_weights_of_another_coding_are_reported(finished, tmp_path, capsys):
-    model = dataclasses.replace(CONFIG.model, regression_axes="ray")
-    for config in (CONFIG, dataclasses.replace(CONFIG, model=model)):
-        train_tiny(tmp_path / config.model.regression_axes, config=config, steps=1, weights=finished[0])
-    lines = capsys.readouterr().err.splitlines()
-    (line,) = [line for line in lines if "weights of" in line]
+def test_initial_weights_of_another_coding_are_reported(finished, capsys):
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, regression_axes="ray"))
+    plan._initial_weights(build_detector(config, SENSOR), finished[0])
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("weights of model.regression_axes 'lidar', to be trained with 'ray'")
-    assert not any(line.startswith("warning: ") for line in lines)
 
 
 OTHERS = {  # what differs from the sensor of the weights, and the warning
-    "the same": ({}, None),
     "name": ({"name": "mine", "limit_xy_m": 20.0}, None),
     "heading": (
         {"forward_rad": SENSOR.forward_rad - np.pi / 2},
         "on clouds rotated by 90 degrees relative to these: ",
     ),
     "place": ({"origin_m": (1.4, 0, 1.6)}, r"with the LiDAR at \(0.0, 0.0, 0.0\) m, here at \(1.4, 0, 1.6\) m: "),
-    "columns": (
-        {"name": "fine", "num_columns": 128},
-        r"for sensor 'tiny' .*, here sensor 'fine' \(16 beams, 128 columns\): the arrays fit, but not the beams",
-    ),
+    "columns": ({"num_columns": 128}, r"for sensor 'tiny' .*, here sensor 'tiny' \(16 beams, 128 columns\): the"),
     "beams": (
         {"name": "few", "inclinations_rad": SENSOR.inclinations_rad[::2]},
         r"for sensor 'tiny' \(16 beams, 64 columns\), here sensor 'few' \(8 beams, 64 columns\): ",
@@ -132,13 +128,18 @@ def test_initial_weights_of_another_sensor_are_reported(finished, capsys, other)
     assert all(re.search(f"^warning: .*: weights trained {message}", line) for line in lines)
 
 
-@pytest.mark.parametrize("classes", [("car",), NUSCENES_CLASSES[::-1]])
-def test_initial_weights_for_other_classes_are_taken_where_they_fit(finished, capsys, classes):
-    detector = build_detector(dataclasses.replace(CONFIG, classes=classes), SENSOR)
+def test_initial_weights_for_other_classes_are_taken_where_they_fit(finished, capsys):
+    detector = build_detector(dataclasses.replace(CONFIG, classes=NUSCENES_CLASSES[::-1]), SENSOR)
     given, taken = load_checkpoint(finished[0]).variables, plan._initial_weights(detector, finished[0])
     assert bits(given["params"]["norm"]) == bits(taken["params"]["norm"])
     assert bits(given["params"]["predictions"]) != bits(taken["params"]["predictions"])
     assert "these start with random weights: predictions (2 of 2 arrays)" in capsys.readouterr().err
+
+
+def test_initial_weights_in_half_precision_are_trained_in_float32():
+    half = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), weights())
+    taken = plan._initial_weights(build_detector(CONFIG, SENSOR), half)
+    assert bits(taken) == bits(jax.tree.map(lambda leaf: leaf.astype(np.float32), half))
 
 
 def test_the_hook_of_the_page_stops_a_run_without_better_scores(tmp_path, monkeypatch):
@@ -175,6 +176,10 @@ def test_all_documented_metrics_are_recorded(finished):
     # The first of four steps is at a tenth of the peak, the second at the peak.
     np.testing.assert_allclose([line["learning_rate"] for line in steps[:2]], [peak / 10, peak], rtol=1e-5)
     np.testing.assert_allclose([line["b1"] for line in steps[:2]], [0.95, 0.85], rtol=1e-5)
+    assert [(step, "test/mAP" in values) for step, values in finished[3]] == [
+        *((1, False), (2, False), (2, True)),
+        *((3, False), (4, False), (4, True)),
+    ]
     for line in tests:
         aps = [line[f"test/AP/{name}"] for name in NUSCENES_CLASSES if f"test/AP/{name}" in line]
         assert line["test/mAP"] == pytest.approx(np.mean(aps))
@@ -182,7 +187,7 @@ def test_all_documented_metrics_are_recorded(finished):
 
 
 def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished):
-    folder, state, _ = finished
+    folder, state, *_ = finished
     names = ".lock run.json metrics.jsonl tensorboard checkpoints pictures loss.png scores.png"
     assert {path.name for path in folder.iterdir()} == set(names.split())
     maps = scores(folder)
@@ -210,7 +215,7 @@ def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished
 
 
 def test_resuming_a_finished_run_changes_nothing(finished, capsys):
-    folder, state, _ = finished
+    folder, state, *_ = finished
     before = contents(folder)
     assert bits(train_tiny(folder, evaluate=2, tests=TESTS, resume=True)) == bits(state)
     assert "the run is complete, with 4 steps" in capsys.readouterr().err
@@ -253,64 +258,108 @@ def without_times(folder: Path) -> list[dict]:
     return [{name: line[name] for name in line.keys() - times} for line in read_metrics(folder)]
 
 
+def fill_disk(host):
+    """Fail like a full disk from now on, by a limit of the file size."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    return host
+
+
+@pytest.fixture
+def limits():
+    """The limits of the file size, which are restored after the test."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield limits
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
 def cut_description(folder: Path) -> None:
     newest = folder / "checkpoints" / "00000003" / "checkpoint.json"
     newest.write_text(newest.read_text()[:-9])
 
 
-# How a run ends: the step and what happens in it, the steps between its saves, a change of its folder afterwards;
-# then the checkpoints in the folder, and what is said when the run stops or resumes. Steps 2 and 4 are evaluated.
+def half_saved(folder: Path) -> None:
+    newest = folder / "checkpoints" / "00000003"
+    newest.rename(newest.with_name(".00000003.abc"))
+
+
+def unrecorded(folder: Path) -> None:
+    *kept, last = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    assert "test/mAP" in last
+    (folder / "metrics.jsonl").write_text("".join(kept))
+
+
+class Event(NamedTuple):
+    """How a run ends early. Steps 2 and 4 are evaluated, and step 2 has the best score."""
+
+    step: int  # the number of steps before it
+    happens: Callable[[HostBatch], HostBatch]  # in the next step
+    code: int  # the exit code
+    left: str  # checkpoints in the folder afterwards
+    said: str  # when the run stops or resumes
+    save: int = 9  # steps between two checkpoints
+    change: Callable[[Path], None] | None = None  # of the folder, before the run resumes
+
+
 TERM = signalled(signal.SIGTERM)
 EVENTS = {
-    "Ctrl-C": (1, signalled(signal.SIGINT), 9, None, "2", "stopped after step 2, which is saved"),
-    "SIGTERM": (2, TERM, 9, None, "2 3", "stopped after step 3, which is saved"),
-    "SIGTERM in a step that is evaluated": (1, TERM, 1, None, "1 2", "stopped after step 2"),
-    "SIGTERM in the last step": (3, TERM, 9, None, "2 4", "stopped after step 4"),  # so that no further run starts
-    "a loss that is not finite": (2, overflowing, 1, None, "1 2", ""),
-    "a damaged checkpoint": (2, TERM, 1, cut_description, "2 3", "going back to the checkpoint before"),
+    "Ctrl-C": Event(1, signalled(signal.SIGINT), 130, "00000002", "stopped after step 2, which is saved"),
+    "SIGTERM": Event(2, TERM, 143, "00000002 00000003", "stopped after step 3, which is saved"),
+    "SIGTERM before the first step": Event(0, TERM, 143, "", ""),
+    "SIGTERM before an evaluation": Event(1, TERM, 143, "00000001 00000002", "stopped after step 2", save=1),
+    # The exit code tells a script that no further run starts.
+    "SIGTERM in the last step, and a kill before its evaluation is recorded": Event(
+        3, TERM, 143, "00000002 00000004", "resuming after step 4", change=unrecorded
+    ),
+    "a kill while saving": Event(
+        2, TERM, 143, ".00000003.abc 00000002", "resuming after step 2", save=1, change=half_saved
+    ),
+    "a damaged checkpoint": Event(
+        2, TERM, 143, "00000002 00000003", "going back to the checkpoint before", save=1, change=cut_description
+    ),
+    "a loss that is not finite": Event(
+        2, overflowing, 1, "00000001 00000002", "; the last checkpoint is ", save=1
+    ),
+    "a full disk": Event(
+        2, fill_disk, 1, "00000001 00000002", "00000003: cannot be written: File too large\n", save=1
+    ),
 }
 
 
+def exit_code_of(run: Callable[[], object]) -> int | str | None:
+    try:
+        return exit_code("train", run)
+    except SystemExit as stop:
+        return stop.code
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("event", EVENTS)
-def test_a_run_that_ends_early_resumes_bit_identical(finished, tmp_path, capsys, monkeypatch, event):
-    step, happens, save, change, left, said = EVENTS[event]
-    whole, state, _ = finished
-    folder, options = tmp_path / "run", {"save": save, "evaluate": 2, "tests": TESTS}
-
-    def run():
-        train_tiny(folder, weights=weights(), **options)
-
-    disturb(monkeypatch, step, happens)
-    if happens is overflowing:
-        message = r"^step 3: not finite: .*; samples: seed \d+, seed \d+; the last checkpoint is .*/00000002$"
-        with pytest.raises(NonFiniteLossError, match=message):
-            run()
-    elif event == "Ctrl-C":
-        with pytest.raises(KeyboardInterrupt):
-            run()
-    else:
-        with pytest.raises(SystemExit, match="143"):
-            exit_code("train", run)
-    if change is not None:
-        change(folder)
-    assert checkpoint_names(folder) == [f"{int(number):08d}" for number in left.split()]
+@pytest.mark.parametrize("event", EVENTS.values(), ids=EVENTS)
+def test_a_run_that_ends_early_resumes_bit_identical(finished, tmp_path, capsys, monkeypatch, limits, event):
+    whole, state, *_ = finished
+    folder = tmp_path / "run"
+    options = {"save": event.save, "evaluate": 2, "tests": TESTS, "weights": weights()}
+    monkeypatch.setattr(runs, "draw_metrics", Mock())
+    monkeypatch.setattr(runs, "draw_predictions", Mock(return_value=[]))
+    disturb(monkeypatch, event.step, event.happens)
+    assert exit_code_of(lambda: train_tiny(folder, **options)) == event.code
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    if event.change is not None:
+        event.change(folder)
+    assert checkpoint_names(folder) == event.left.split()
     disturb(monkeypatch, -1, None)
     assert bits(train_tiny(folder, resume=True, **options)) == bits(state)
-    assert said in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert event.said in told
+    assert "Traceback" not in told
     assert without_times(folder) == without_times(whole)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [STEPS - 1, STEPS])
-def test_a_run_that_is_killed_in_its_last_step_or_only_save_begins_again(finished, tmp_path, steps):
-    folder, options = tmp_path / "run", {"save": 9, "weights": weights()}
-    train_tiny(folder, **options)
-    shutil.rmtree(folder / "checkpoints")
-    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
-    (folder / "metrics.jsonl").write_text("".join(lines[:steps]))
-    assert bits(train_tiny(folder, resume=True, **options)) == bits(finished[1])
-    assert checkpoint_names(folder) == ["00000004"]
+def test_a_run_that_is_killed_in_its_only_save_begins_again(finished, begun):
+    lines = (line for line in read_metrics(finished[0]) if "test/mAP" not in line)
+    (begun / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert bits(train_tiny(begun, save=9, tests=TESTS, resume=True, weights=weights())) == bits(finished[1])
+    assert checkpoint_names(begun) == ["00000004"]
 
 
 def test_processes_with_other_data_are_refused_before_the_run_starts(tmp_path, monkeypatch):
@@ -345,76 +394,6 @@ def test_processes_that_find_other_checkpoints_are_refused(finished, tmp_path, m
 
 
 @pytest.mark.slow
-def test_weights_in_half_precision_are_trained_in_float32(tmp_path):
-    half, same = (
-        {"weights": jax.tree.map(cast, weights())}
-        for cast in (
-            lambda leaf: np.asarray(leaf, np.float16),
-            lambda leaf: np.asarray(leaf, np.float16).astype(np.float32),
-        )
-    )
-    assert bits(train_tiny(tmp_path / "half", **half)) == bits(train_tiny(tmp_path / "same", **same))
-
-
-STOPPED = """
-import os, resource, signal, sys
-import linear_network
-from tiny_run import train_tiny, weights
-from fcos_lidar_jax.cli import exit_code
-from fcos_lidar_jax.training import run
-full, killed = sys.argv[1:]
-linear_network.use()
-make_train_step, made = run.make_train_step, {}
-run.make_train_step = lambda *given: made.setdefault("step", make_train_step(*given))  # compiled once
-limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-def fill(step, _):
-    if step == 3:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
-assert exit_code("program", lambda: train_tiny(full, weights=weights(), hooks=[fill])) == 1
-resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-# Called when the third checkpoint is written and not yet in its place.
-os.chmod = lambda path, mode: ".00000003." in str(path) and os.kill(os.getpid(), signal.SIGKILL)
-train_tiny(killed, weights=weights())
-"""
-
-
-@pytest.fixture(scope="module")
-def stopped(finished, tmp_path_factory) -> tuple[Path, Path, list[str]]:
-    """The folders of two runs of one process, and its messages: the disk was full, and the process was killed."""
-    full, killed = (tmp_path_factory.mktemp(name) for name in ("full", "killed"))
-    done = run_python("-c", STOPPED, full, killed)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    return full, killed, done.stderr.splitlines()
-
-
-@pytest.mark.slow
-def test_a_run_that_is_killed_while_saving_resumes_bit_identical(finished, stopped):
-    _, folder, _ = stopped
-    assert [name[:9] for name in checkpoint_names(folder)] == [".00000003", "00000001", "00000002"]
-    assert bits(train_tiny(folder, resume=True)) == bits(finished[1])
-    assert checkpoint_names(folder) == ["00000003", "00000004"]
-
-
-@pytest.mark.slow
-def test_a_run_that_is_killed_before_its_first_checkpoint_resumes_with_the_initial_weights(finished, begun):
-    assert bits(train_tiny(begun, evaluate=2, tests=TESTS, resume=True, weights=weights())) == bits(finished[1])
-    assert scores(begun) == scores(finished[0])  # the initial weights are not evaluated
-    assert checkpoint_names(begun) == checkpoint_names(finished[0])
-
-
-@pytest.mark.slow
-def test_a_full_disk_is_reported_in_one_line_and_loses_no_checkpoint(stopped):
-    """A limit of the file size, from the third checkpoint on, fails as a full disk does."""
-    folder, _, messages = stopped
-    lines = [line for line in messages if not line.startswith(("compiling ", "steps "))]
-    lines = [line for line in lines if "cpu_aot_loader.cc" not in line]  # jaxlib 0.10.1 about its own cache
-    refused = folder / "checkpoints" / "00000003"
-    assert lines == [f"program: error: {refused}: cannot be written: File too large"]
-    assert checkpoint_names(folder) == ["00000001", "00000002"]
-    assert [load_checkpoint(path).step for path in sorted(refused.parent.iterdir())] == [1, 2]
-
-
-@pytest.mark.slow
 def test_a_checkpoint_without_a_mean_ap_is_saved_without_a_score(tmp_path, capsys):
     """The test frames have no boxes, so the mean over classes is NaN."""
     none = np.zeros(0, np.int32)
@@ -433,11 +412,7 @@ def test_a_checkpoint_without_a_mean_ap_is_saved_without_a_score(tmp_path, capsy
     [
         ("config.loss.l1_weight", 9.0, "0.25"),
         ("config.model.remat", None, "False"),
-        ("sensor.num_columns", 8, "64"),
         ("steps", 5, "4"),
-        ("seed", 1, "0"),
-        ("seed", None, "0"),
-        ("ground_truth_database", None, "None"),
         ("ground_truth_database", "x", "None"),
         ("data", "other frames", ""),
     ],
@@ -459,26 +434,15 @@ def test_a_different_specification_is_refused_and_the_field_named(begun, field, 
 
 
 LOST = "checkpoints: found none, but metrics of 4 steps, and this schedule saves step"
+AGAIN = {"resume": True}
 REFUSED = {  # what is removed from the folder of a run and written to it, options, and the error
     "another run": ("", {}, {}, "holds a run, expected another folder or --resume, in Python resume=T"),
-    "no run": (
-        "run.json metrics.jsonl checkpoints",
-        {},
-        {"resume": True},
-        "run.json: found nothing, expected the run",
-    ),
-    "no folder": (".", {}, {"resume": True}, "run.json: found nothing, expected the run"),
-    "no JSON": ("", {"run.json": "{"}, {"resume": True}, "run.json: not JSON"),
-    "a checkpoint": ("run.json", {}, {}, "00000004: found a checkpoint without run.json, expected another"),
-    "metrics": (
-        "run.json checkpoints",
-        {},
-        {},
-        r"metrics\.jsonl: found metrics without run\.json, expected another",
-    ),
-    "no checkpoints": ("checkpoints", {}, {"resume": True}, f"{LOST} 1: expected the"),
+    "no run": ("run.json metrics.jsonl checkpoints", {}, AGAIN, "run.json: found nothing, expected the run"),
+    "no folder": (".", {}, AGAIN, "run.json: found nothing, expected the run"),
+    "no JSON": ("", {"run.json": "{"}, AGAIN, "run.json: not JSON"),
+    "results": ("run.json", {}, {}, r"metrics\.jsonl: found without run\.json, expected another"),
+    "no checkpoints": ("checkpoints", {}, AGAIN, f"{LOST} 1: expected the"),
     "no last checkpoint": ("checkpoints", {}, {"resume": True, "save": 9, "evaluate": 9}, f"{LOST} 4"),
-    "a file": (".", {".": ""}, {}, "found a file, expected a folder"),
 }
 
 
@@ -496,102 +460,46 @@ def test_a_folder_without_the_run_is_refused_and_unchanged(finished, tmp_path, c
     assert (contents(tmp_path), set(tmp_path.rglob("*"))) == before
 
 
-@pytest.mark.parametrize("part", ["params", "network"])
-def test_arrays_of_another_network_are_refused_before_anything_is_written(tmp_path, part):
-    own = weights()
-    given = own["params"] if part == "params" else {**own, "params": {"kernel": np.ones(3)}}
-    with pytest.raises(ValueError, match=r"^weights: .*: the arrays do not belong to the network to be trained"):
-        train_tiny(tmp_path / "run", weights=given)
-    assert list(tmp_path.iterdir()) == []
-
-
-def begin_again(run):
-    """Make a run look as if it had been killed before its first checkpoint."""
-    shutil.rmtree(run / "checkpoints")
-    (run / "metrics.jsonl").unlink()
-
-
-@pytest.mark.slow
-def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(tmp_path):
-    start, run = tmp_path / "start", tmp_path / "run"
-    options = {"weights": start, "steps": 1}
-    first = weights()
-    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, first, 1))
-    train_tiny(run, **options)
-    other = jax.tree.map(lambda leaf: leaf * 2, first)
-    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, other, 1))
-    train_tiny(run, resume=True, **options)  # from its own checkpoint
-    begin_again(run)
-    with pytest.raises(ValueError, match=r"run.json: weights_hash: was '\w+', got '\w+': only the same run"):
-        train_tiny(run, resume=True, **options)
-    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, first, 2, score=0.5))  # the same weights
-    train_tiny(run, resume=True, **options)
-    spec = json.loads((run / "run.json").read_text())
+def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(finished, begun):
+    spec = json.loads((begun / "run.json").read_text())
+    other = spec | {"weights_hash": "0123"}
+    plan.check_run(finished[0], other, resume=True)  # from its own checkpoint
+    with pytest.raises(ValueError, match=r"run.json: weights_hash: was '\w+', got '0123': only the same run"):
+        plan.check_run(begun, other, resume=True)
     del spec["weights_hash"]  # as in a run of an earlier version
-    (run / "run.json").write_text(json.dumps(spec))
-    begin_again(run)
-    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, other, 1))
-    train_tiny(run, resume=True, **options)
-
-
-def test_a_different_ground_truth_database_of_the_same_frames_is_refused(begun, tmp_path):
-    config = dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())
-    first, other = (prepare_database(FRAMES, tmp_path / str(n), min_points=n) for n in (6, 5))
-    assert first.manifest.source == other.manifest.source
-    spec = json.loads((begun / "run.json").read_text()) | {"objects": first.manifest.source}
-    spec |= {"config": plan.recorded_config(config, FRAMES), "ground_truth_database": first.fingerprint()}
     (begun / "run.json").write_text(json.dumps(spec))
-    message = f"ground_truth_database: was '{first.fingerprint()}', got '{other.fingerprint()}': only the same run"
-    with pytest.raises(ValueError, match=message):
-        train_tiny(begun, resume=True, config=config, objects=other)
+    plan.check_run(begun, other, resume=True)
 
 
-@pytest.mark.slow
-def test_a_run_that_is_killed_during_an_evaluation_repeats_it_on_resume(finished, tmp_path, monkeypatch):
-    folder, evaluate, evaluated = tmp_path / "run", runs._evaluate, []
+def in_memory(*frames: Frame) -> InMemoryFrames:
+    return InMemoryFrames(frames, FRAMES.sensor, FRAMES.classes)
 
-    def killed(*_):
-        raise SystemExit(137)
 
-    def noted(run, number, *rest):
-        evaluated.append(number)
-        return evaluate(run, number, *rest)
+def without_points(frame: Frame) -> Frame:
+    return dataclasses.replace(frame, num_points=0 * frame.num_points)
 
-    monkeypatch.setattr(runs, "_evaluate", killed)
-    with pytest.raises(SystemExit):
-        train_tiny(folder, evaluate=2, tests=TESTS, weights=weights())
-    assert checkpoint_names(folder)[-1] == "00000002"
-    assert load_checkpoint(folder / "checkpoints" / "00000002").score is None
-    monkeypatch.setattr(runs, "_evaluate", noted)
-    hooked = []
-    options = {"hooks": [lambda *call: hooked.append(call)]}
-    assert bits(train_tiny(folder, evaluate=2, tests=TESTS, resume=True, **options)) == bits(finished[1])
-    assert evaluated == [2, 4]
-    assert [(number, "test/mAP" in values) for number, values in hooked] == [
-        (2, True),
-        (3, False),
-        (4, False),
-        (4, True),
-    ]
-    assert {number: values["test/mAP"] for number, values in hooked if "test/mAP" in values} == scores(folder)
-    # After an evaluation, hooks get the scores only.
-    kinds = [{name.partition("/")[0] for name in values} for _, values in hooked]
-    assert (
-        [kind == {"test"} for kind in kinds]
-        == ["loss" not in kind for kind in kinds]
-        == [True, False, False, True]
-    )
-    assert scores(folder) == scores(finished[0])
-    assert load_checkpoint(folder / "checkpoints" / "00000004").score == scores(folder)[4]
-    # Killed after the last evaluation and before its record.
-    records = read_metrics(folder)
-    *kept, last = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
-    assert "test/mAP" in last
-    (folder / "metrics.jsonl").write_text("".join(kept))
-    for _ in range(2):  # the second time, nothing is left to do
-        train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
-        assert evaluated == [2, 4, 4]
-        assert read_metrics(folder) == records
+
+def far(frame: Frame) -> Frame:
+    return dataclasses.replace(frame, points=frame.points * np.float32([1000, 1000, 1000, 1, 1]))
+
+
+GIVEN = [FRAMES.frame(index) for index in range(3)]
+WARNINGS = {
+    "boxes without points": (
+        [GIVEN[0], *map(without_points, GIVEN[1:])],
+        "contain no point and are not learned: are points and boxes in the same frame?",
+    ),
+    "another sensor": ([GIVEN[0], far(GIVEN[1])], "^frame 1: points do not fit sensor 'tiny'"),
+    "nothing": (GIVEN, None),
+}
+
+
+@pytest.mark.parametrize("case", WARNINGS)
+def test_data_that_may_not_be_learned_are_reported(case):
+    frames, message = WARNINGS[case]
+    lines = list(plan._warnings(in_memory(*frames), CONFIG))
+    assert len(lines) == (message is not None)
+    assert all(re.search(message, line) for line in lines)
 
 
 def test_single_sweeps_are_reported_if_several_are_configured(tmp_path, capsys):
@@ -599,25 +507,9 @@ def test_single_sweeps_are_reported_if_several_are_configured(tmp_path, capsys):
     assert "warning: num_sweeps: got 3, but the frames hold one sweep each: expected 1" in capsys.readouterr().err
 
 
-def test_boxes_without_points_are_reported(tmp_path, capsys):
-    frames = [FRAMES.frame(i) for i in range(4)]
-    others = [dataclasses.replace(frame, num_points=0 * frame.num_points) for frame in frames[1:]]
-    own = InMemoryFrames((frames[0], *others), FRAMES.sensor, FRAMES.classes)
-    train_tiny(tmp_path / "run", frames=own, steps=1)
-    assert "contain no point and are not learned: are points and boxes in the same" in capsys.readouterr().err
-
-
 class PartialFrames(InMemoryFrames):
     def check_files(self, indices):
         raise ValueError(f"{len([*indices])} keyframes are missing")
-
-
-@pytest.mark.parametrize("which", ["frames", "tests"])
-def test_missing_files_are_refused_before_the_first_step(tmp_path, which):
-    partial = PartialFrames(tuple(FRAMES.frame(i) for i in range(2)), FRAMES.sensor, FRAMES.classes)
-    with pytest.raises(ValueError, match="2 keyframes are missing"):
-        train_tiny(tmp_path / "run", **{"tests": TESTS, which: partial})
-    assert not (tmp_path / "run").exists()
 
 
 class UnreadableFrames(InMemoryFrames):
@@ -625,29 +517,31 @@ class UnreadableFrames(InMemoryFrames):
         raise ValueError("clouds/0.npy: empty file")
 
 
-def without_points(index: int) -> Frame:
-    frame = FRAMES.frame(index)
-    return dataclasses.replace(frame, num_points=0 * frame.num_points)
+def rings(frame: Frame) -> Frame:
+    points = frame.points.copy()
+    points[:, 4] = np.arange(len(points)) % 16 / 15
+    return dataclasses.replace(frame, points=points)
 
 
-UNREADABLE = UnreadableFrames((FRAMES.frame(0),), FRAMES.sensor, FRAMES.classes)
-EMPTY = InMemoryFrames(tuple(map(without_points, range(3))), FRAMES.sensor, FRAMES.classes)
+PARTIAL = PartialFrames(tuple(GIVEN[:2]), FRAMES.sensor, FRAMES.classes)
+UNREADABLE = UnreadableFrames((GIVEN[0],), FRAMES.sensor, FRAMES.classes)
+OTHER_NETWORK = {"params": {"kernel": np.ones(3)}, "batch_stats": {}}
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps: got 0, expected an integer from 1 to 2147483647"),
-        ({"steps": 2.5}, "steps: got 2.5, expected an integer"),
+        ({"steps": 2.5}, "steps: got 2.5, expected an integer from 1 to 2147483647"),
         ({"seed": 2**32}, "seed: got 4294967296, expected an integer from 0 to 4294967295"),
         ({"config": dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())}, "copy_paste: got no ground-truth"),
-        ({"config": "quickstart"}, "config: got 'quickstart', expected a Config"),
         ({"frames": "my_lidar"}, "frames: got 'str', expected a set of frames, as open_frames returns"),
-        ({"schedule": 5}, "schedule: got 5, expected a Schedule"),
         ({"threads": -1}, "threads: got -1, expected at least 0"),
-        ({"workers": -1}, "workers: got -1, expected at least 0"),
         ({"frames": UNREADABLE}, "clouds/0.npy: empty file"),
-        ({"frames": EMPTY}, "frame 'frame 0': box 0: got 0 points, like all boxes of 3 frames"),
+        ({"frames": PARTIAL}, "2 keyframes are missing"),
+        ({"tests": PARTIAL}, "2 keyframes are missing"),
+        ({"frames": in_memory(*map(without_points, GIVEN))}, "box 0: got 0 points, like all boxes of 3"),
+        ({"frames": in_memory(rings(GIVEN[0]))}, "frame 0: fifth column: got 16 different values up to 1"),
+        ({"weights": OTHER_NETWORK}, "^weights: .*: the arrays do not belong to the network to be trained"),
     ],
 )
 def test_invalid_arguments_are_refused_before_the_run_starts(tmp_path, options, message):

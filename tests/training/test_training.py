@@ -3,7 +3,6 @@
 import collections
 import dataclasses
 import functools
-import inspect
 import re
 from pathlib import Path
 
@@ -14,13 +13,11 @@ import optax
 import oracles
 import pytest
 import tiny_peer
-from refusal import refused
-from tiny_run import TINY_CONFIG, TINY_REFINED, weights
+from tiny_run import SENSOR, TINY_CONFIG, TINY_REFINED, weights
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.coding import encode
 from fcos_lidar_jax.config import OptimizerConfig
-from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.evaluation.matching import match_frame
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.input_pipeline.batching import make_batch
@@ -29,7 +26,6 @@ from fcos_lidar_jax.models import Detector, build_detector, objective
 from fcos_lidar_jax.models.objective import location_owners, make_sums, sample_losses
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import NonFiniteLossError, fit, make_optimizer, make_state, make_train_step, plan
 from fcos_lidar_jax.training.optimizer import learning_rate_schedule, momentum_schedule
@@ -45,7 +41,7 @@ CONFIG = dataclasses.replace(
     loss=dataclasses.replace(QUICKSTART.loss, l1_weight=1.0),
 )
 SIZES = {"max_points": CONFIG.max_points, "max_boxes": CONFIG.max_boxes}
-FRAMES = SimulatedFrames(TINY, 1000)
+FRAMES = SimulatedFrames(SENSOR, 1000)
 
 
 def host_batches(batch, count=STEPS):
@@ -71,7 +67,7 @@ def counted(function):
 @pytest.fixture(scope="module")
 def trainer():
     """Detector, state and a jitted step that counts its traces."""
-    detector = build_detector(CONFIG, TINY)
+    detector = build_detector(CONFIG, SENSOR)
     optimizer, key = make_optimizer(CONFIG.optimizer, STEPS), jax.random.key(0)
     return detector, make_state(detector, optimizer, key), *counted(make_train_step(detector, optimizer))
 
@@ -135,9 +131,7 @@ def test_a_step_is_finite_without_boxes_and_points(trainer, num_points, with_box
     ("name", "shape", "message"),
     [
         ("labels", (1, 6), r"labels: got shape \(6,\), expected \(32,\)"),
-        ("box_valid", (1, 6), r"box_valid: got shape \(6,\), expected \(32,\)"),
         ("boxes", (2, 32, 9), r"boxes: got shape \(2, 32, 9\), expected \(1, ... ...\)"),
-        ("labels", (32,), r"labels: got shape \(32,\), expected \(1, ...\)"),
     ],
 )
 def test_a_step_refuses_a_batch_whose_arrays_do_not_fit_each_other(trainer, name, shape, message):
@@ -152,8 +146,8 @@ def test_a_step_refuses_a_batch_whose_arrays_do_not_fit_each_other(trainer, name
 def test_the_owner_of_a_location_is_the_owner_of_its_first_round_point():
     scene = frame(5)
     box_valid = np.ones(len(scene.boxes), bool)
-    layout = image_layout(TINY, CONFIG.model)
-    image = project_points(scene.points, np.ones(len(scene.points), bool), TINY, num_rounds=2)
+    layout = image_layout(SENSOR, CONFIG.model)
+    image = project_points(scene.points, np.ones(len(scene.points), bool), SENSOR, num_rounds=2)
     locations = locate(image, layout)
     owner = np.asarray(location_owners(image, locations, jnp.asarray(scene.boxes), jnp.asarray(box_valid)))
     index = np.asarray(image.point_index)[..., 0].reshape(-1)
@@ -164,23 +158,6 @@ def test_the_owner_of_a_location_is_the_owner_of_its_first_round_point():
     expected = [oracles.owner(scene.points[row, :3], boxes, box_valid) if row >= 0 else -1 for row in rows]
     np.testing.assert_array_equal(owner[sample], expected)
     assert sum(box >= 0 for box in expected) > 10
-
-
-def test_a_step_keeps_the_types_of_the_state_and_none_is_weak(trainer):
-    _, state, step, _ = trainer
-    after, _ = step(state, make_batch([frame(1)], **SIZES))
-
-    def kinds(tree):
-        return [jax.typeof(leaf) for leaf in jax.tree.leaves(tree)]
-
-    assert kinds(state) == kinds(after)
-    assert not any(getattr(kind, "weak_type", False) for kind in kinds(state))
-
-
-def test_a_seed_is_no_key(trainer):
-    unchecked = inspect.unwrap(make_state)  # without the types that the tests check in signatures
-    with pytest.raises(ValueError, match=r"^key: got 7, expected a random key, such as jax.random.key\(7\)$"):
-        unchecked(trainer[0], make_optimizer(CONFIG.optimizer, STEPS), 7)
 
 
 def test_schedules_have_the_end_points_of_the_paper():
@@ -231,20 +208,9 @@ def test_the_loop_reads_all_metrics_before_a_pause_and_stops_when_asked(trainer)
     assert asked == [1, 2, 3, 4, 5]
 
 
-def test_augmentation_depends_only_on_seed_step_and_sample():
-    detector = toy_detector(dataclasses.replace(CONFIG, augment=QUICKSTART.augment))
-    optimizer = make_optimizer(CONFIG.optimizer, STEPS)
-    state = make_state(detector, optimizer, jax.random.key(0))
-    step = jax.jit(make_train_step(detector, optimizer))
-    batch = make_batch([frame(3)], **SIZES)
-    first, again = (step(state, batch)[1]["loss/total"] for _ in range(2))
-    later = step(dataclasses.replace(state, step=state.step + 1), batch)[1]["loss/total"]
-    assert float(first) == float(again) != float(later)
-
-
 def toy_detector(config=CONFIG) -> Detector:
     """A network with one weight per output, scaled by a mean of the sample: no batch norm, quick to compile."""
-    layout = image_layout(TINY, CONFIG.model)
+    layout = image_layout(SENSOR, CONFIG.model)
     kinds, rows = len(CONFIG.classes), layout.num_locations
     shapes = {"logits": (rows, kinds + 1), "regression": (rows, 10, kinds), "iou_logits": (rows, kinds)}
 
@@ -259,7 +225,7 @@ def toy_detector(config=CONFIG) -> Detector:
         outputs = {n: jnp.einsum("b,...->b...", size, leaf) for n, leaf in variables["params"].items()}
         return Outputs(**outputs), {}
 
-    return build_detector(config, TINY)._replace(init=init, apply=apply)
+    return build_detector(config, SENSOR)._replace(init=init, apply=apply)
 
 
 def with_optimizer(**changes):
@@ -275,21 +241,21 @@ def four_frames() -> Batch:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("axes", "micro_batches"), [("lidar", (1, 2)), ("ray", (1,))])
-def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches):
+@pytest.mark.parametrize(("axes", "accumulate"), [("lidar", 2), ("ray", 1)])
+def test_each_loss_is_divided_by_the_number_of_its_locations(axes, accumulate):
     """Compares with NumPy, with and without micro-batches: cross-entropy over positives, L1 over candidates."""
     choices = dataclasses.replace(
         CONFIG.loss, regress_on="candidates", l1_weight=0.5, iou_weight=0.0, iou_prediction_weight=0.0
     )
     detector = toy_detector()
     params, batch = detector.init(jax.random.key(0))["params"], jax.tree.map(jnp.asarray, four_frames())
-    layout = image_layout(TINY, CONFIG.model)
+    layout = image_layout(SENSOR, CONFIG.model)
     expected = {name: np.zeros(leaf.shape) for name, leaf in params.items()}
     losses, positives, candidates = {"classification": 0.0, "l1": 0.0}, 0, 0
     project = jax.jit(project_points, static_argnames=("sensor", "num_rounds"))
     targets_of = jax.jit(lambda *sample: sample_losses(*sample, config=choices, layout=layout, axes=axes)[1])
     for points, valid, boxes, labels, box_valid in zip(*jax.tree.leaves(batch), strict=True):
-        image = project(points, valid, TINY, num_rounds=CONFIG.projection.num_rounds)
+        image = project(points, valid, SENSOR, num_rounds=CONFIG.projection.num_rounds)
         outputs, _ = detector.apply({"params": params}, jax.tree.map(lambda leaf: leaf[None], image), train=True)
         outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
         targets = targets_of(outputs, image, boxes, labels, box_valid)
@@ -313,21 +279,14 @@ def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches
             expected["regression"][l, :, label] += 0.5 * size * weights * np.sign(np.nan_to_num(off))
             candidates += 1
     assert candidates > 2 * positives > 20
-    metrics_of = []
-    for accumulate in micro_batches:
-        model = dataclasses.replace(CONFIG.model, regression_axes=axes)
-        config = dataclasses.replace(
-            with_optimizer(batch_size=4, accumulate=accumulate), loss=choices, model=model
-        )
-        gradient, _, metrics = jax.jit(make_gradient(toy_detector(config)))(params, {}, batch)
-        assert (int(metrics["positives"]), int(metrics["candidates"])) == (positives, candidates)
-        np.testing.assert_allclose(metrics["loss/classification"], losses["classification"] / positives, rtol=1e-4)
-        np.testing.assert_allclose(metrics["loss/l1"], losses["l1"] / candidates, rtol=1e-4)
-        np.testing.assert_allclose(gradient["logits"], expected["logits"] / positives, rtol=1e-3, atol=1e-6)
-        regression = expected["regression"] / candidates
-        np.testing.assert_allclose(gradient["regression"], regression, rtol=1e-3, atol=1e-8)
-        metrics_of.append(metrics)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), metrics_of[0], metrics_of[-1])
+    model = dataclasses.replace(CONFIG.model, regression_axes=axes)
+    config = dataclasses.replace(with_optimizer(batch_size=4, accumulate=accumulate), loss=choices, model=model)
+    gradient, _, metrics = jax.jit(make_gradient(toy_detector(config)))(params, {}, batch)
+    assert (int(metrics["positives"]), int(metrics["candidates"])) == (positives, candidates)
+    np.testing.assert_allclose(metrics["loss/classification"], losses["classification"] / positives, rtol=1e-4)
+    np.testing.assert_allclose(metrics["loss/l1"], losses["l1"] / candidates, rtol=1e-4)
+    np.testing.assert_allclose(gradient["logits"], expected["logits"] / positives, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(gradient["regression"], expected["regression"] / candidates, rtol=1e-3, atol=1e-8)
 
 
 def test_every_weight_of_the_configuration_has_a_loss(trainer):
@@ -353,30 +312,18 @@ def test_a_new_loss_is_divided_by_the_locations_of_the_regression(monkeypatch):
     monkeypatch.setattr(objective, "sample_losses", with_height)
     for regress_on in ("positives", "candidates"):
         config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, regress_on=regress_on))
-        detector = toy_detector(config)._replace(sums=make_sums(config, TINY))
+        detector = toy_detector(config)._replace(sums=make_sums(config, SENSOR))
         params = detector.init(jax.random.key(0))["params"]
         found = jax.eval_shape(functools.partial(losses, detector), params, four_frames())
         assert {"l1", "height"} <= set(found[regress_on])
-
-
-def test_a_warning_names_a_frame_that_does_not_fit_the_sensor():
-    frames = [frame(seed) for seed in range(3)]
-    shifted = frames[1].points * np.float32([1000, 1000, 1000, 1, 1])
-    frames[1] = dataclasses.replace(frames[1], points=shifted)
-    made = InMemoryFrames(tuple(frames), TINY, NUSCENES_CLASSES)
-    [warning] = plan._warnings(made, CONFIG)
-    assert warning.startswith(f"{made.name(1)}: points do not fit")
-    frames[0].points[:, 4] = np.arange(len(frames[0].points)) % 16 / 15
-    with refused("fifth column: got 16 different values up to 1, expected the time lag", made.name(0)):
-        list(plan._warnings(made, CONFIG))
 
 
 @pytest.mark.slow
 def test_the_target_of_the_score_factor_is_the_iou_or_the_centreness():
     """Predictions are half a metre above the truth: centreness is constant, and IoU depends on the height."""
     detector, batch = toy_detector(), jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], four_frames())
-    params, layout = detector.init(jax.random.key(0))["params"], image_layout(TINY, CONFIG.model)
-    image = project_points(batch.points, batch.valid, TINY, num_rounds=CONFIG.projection.num_rounds)
+    params, layout = detector.init(jax.random.key(0))["params"], image_layout(SENSOR, CONFIG.model)
+    image = project_points(batch.points, batch.valid, SENSOR, num_rounds=CONFIG.projection.num_rounds)
     outputs, _ = detector.apply({"params": params}, jax.tree.map(lambda leaf: leaf[None], image), train=True)
     outputs, locations = jax.tree.map(lambda leaf: leaf[0], outputs), locate(image, layout)
     owner = location_owners(image, locations, batch.boxes, batch.box_valid)
@@ -417,7 +364,7 @@ def squares():
         return Sums({"positives": {"classification": total}}, {"positives": count}, {"positives": {"mean": total}})
 
     def detector(config=CONFIG):
-        return build_detector(config, TINY)._replace(apply=apply, sums=sums)
+        return build_detector(config, SENSOR)._replace(apply=apply, sums=sums)
 
     batch = empty_batch(0)
     batch = jax.tree.map(lambda leaf: np.repeat(leaf, 8, axis=0), batch)
@@ -426,11 +373,24 @@ def squares():
     return detector, batch, row_lists
 
 
+def test_augmentation_depends_only_on_seed_and_step(squares):
+    config = dataclasses.replace(with_optimizer(ema_decay=0.0, batch_size=8), augment=QUICKSTART.augment)
+    detector, optimizer, batch = squares[0](config), optax.sgd(0.0), squares[1]
+    state = make_state(detector, optimizer, jax.random.key(0), variables=ZERO)
+    others = (
+        state,
+        dataclasses.replace(state, step=state.step + 1),
+        dataclasses.replace(state, key=jax.random.key(1)),
+    )
+    step = jax.jit(make_train_step(detector, optimizer))
+    first, again, later, other = (float(step(each, batch)[1]["loss/total"]) for each in (state, *others))
+    assert first == again
+    assert len({first, later, other}) == 3
+
+
 RATE = optax.inject_hyperparams(optax.sgd)(learning_rate=0.125)
 OPTIMIZERS = {  # the steps until the first update, and the hyperparameters that are reported
     "adam": (optax.adam(0.1), 1, {}),
-    "sgd": (optax.sgd(0.1, momentum=0.9), 1, {}),
-    "lion": (optax.lion(0.1), 1, {}),
     "MultiSteps": (optax.MultiSteps(RATE, 2), 2, {"learning_rate": 0.125}),
     "inject_hyperparams": (RATE, 1, {"learning_rate": 0.125}),
     "partition": (optax.partition({"all": RATE}, {"w": "all"}), 1, {"all/learning_rate": 0.125}),
@@ -458,7 +418,7 @@ def test_a_step_works_with_any_optimizer_and_reports_its_hyperparameters(squares
         assert float(metrics[key]) == pytest.approx(value)
 
 
-@pytest.mark.parametrize("num_micro", [1, 2, 8])
+@pytest.mark.parametrize("num_micro", [1, 2])
 def test_gradients_are_divided_by_all_positives_and_micro_batches_are_strided(squares, num_micro):
     """By hand: the gradient is the mean of 2 (w - x) over all boxes."""
     detector, batch, row_lists = squares
@@ -487,8 +447,7 @@ def test_the_running_mean_of_the_weights_matches_a_loop(squares):
     np.testing.assert_allclose(state.ema["w"], mean, rtol=1e-6)
     assert abs(mean - float(state.params["w"])) > 1e-5
     assert detection_variables(state) == {"params": state.ema, "batch_stats": {}}
-    plain = make_state(make(), optimizer, jax.random.key(0), variables=ZERO)
-    assert plain.ema is None
+    plain = dataclasses.replace(state, ema=None)
     assert detection_variables(plain) == {"params": plain.params, "batch_stats": {}}
 
 
@@ -520,13 +479,9 @@ def test_a_loss_that_is_not_finite_stops_the_run_before_a_pause(squares):
 GROUPED = dataclasses.replace(
     tiny_peer.CONFIG, pillars=dataclasses.replace(tiny_peer.CONFIG.pillars, groups=(0,) * 5 + (1,) * 5)
 )
-CAR = ("car",)
 CLASSES = {  # the weights, and the part of the network and its arrays that other classes start anew
-    "fewer": (TINY_CONFIG, CAR, {"heads": 12}),
-    "another order": (TINY_CONFIG, NUSCENES_CLASSES[::-1], {"heads": 12}),
-    "a second look": (TINY_REFINED, CAR, {"heads": 12, "refinement": 3}),
-    "CenterPoint": (tiny_peer.CONFIG, CAR, {"heads": 2}),
-    "groups": (GROUPED, NUSCENES_CLASSES[::-1], {"heads": 4}),
+    "a second look": (TINY_REFINED, ("car",), {"heads": 12, "refinement": 3}),
+    "groups of CenterPoint": (GROUPED, NUSCENES_CLASSES[::-1], {"heads": 4}),
 }
 
 
@@ -534,7 +489,7 @@ CLASSES = {  # the weights, and the part of the network and its arrays that othe
 def test_weights_for_other_classes_keep_all_arrays_that_do_not_depend_on_them(capsys, case):
     config, classes, anew = CLASSES[case]
     given = weights(config)
-    detector = build_detector(dataclasses.replace(config, classes=classes), TINY)
+    detector = build_detector(dataclasses.replace(config, classes=classes), SENSOR)
     taken = plan._for_other_classes(Path("start"), config.classes, given, detector)
     assert jax.tree.structure(taken) == jax.tree.structure(given)
     pairs = zip(jax.tree.leaves_with_path(given), jax.tree.leaves(taken), strict=True)
