@@ -18,6 +18,7 @@ from fcos_lidar_jax.fields import (
     Checked,
     Count,
     Counts,
+    Finite,
     Natural,
     Positive,
     Positives,
@@ -112,7 +113,7 @@ class ModelConfig(Checked):
     """Not in the paper: with local geometry, also the offsets from each location's point to the points of the
     later rounds in its pixel."""
     background_prior: Between = 0.99  # Our choice: initial background probability.
-    channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
+    channel_mean: Finite = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Our choice: mean of each of ``types.CHANNELS``, subtracted in preprocessing, and of channels of your own."""
     channel_scale: Positives = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
     """Our choice: scale of each channel, by which it is divided in preprocessing."""
