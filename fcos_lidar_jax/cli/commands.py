@@ -3,7 +3,7 @@
 import contextlib
 import io
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import reduce
 from operator import or_
 from typing import Annotated, Any
 
@@ -51,9 +51,13 @@ def parse(argv: Sequence[str]) -> Callable[[], object]:
         raise ValueError(rejection)
     if command is None:
         command = _parse(argv)  # again, to print the help or the usage error
-    check_options(command)
     run = next(run for kind, run, _ in _COMMANDS.values() if isinstance(command, kind))
-    return partial(run, command)
+
+    def checked() -> None:
+        check_options(command)
+        run(command)
+
+    return checked
 
 
 def _parse(argv: Sequence[str]) -> Any:
