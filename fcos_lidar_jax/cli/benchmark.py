@@ -14,13 +14,13 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_at_least, check_outputs
+from fcos_lidar_jax.cli.checks import Output
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
-from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.fields import Bounds, Count
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import CloudDetector, TrainedDetector, load_detector
 from fcos_lidar_jax.inference.detect import make_stages
@@ -49,18 +49,18 @@ class Benchmark:
     ] = ()
     """Point files, one cloud per file, or folders of them."""
     checkpoint: options.Detector = tyro.MISSING
-    out: Annotated[Path | None, option("FILE")] = None  # Also write the times as JSON.
-    batch: Annotated[tuple[int, ...], option("N...", default="1 2 4, or the exported size")] = ()  # Batch sizes.
-    repeats: int = 20  # Timed runs of each stage.
+    out: Annotated[Path | None, Output.FILE, option("FILE")] = None  # Also write the times as JSON.
+    batch: Annotated[
+        tuple[int, ...], Bounds(1, empty=True), option("N...", default="1 2 4, or the exported size")
+    ] = ()
+    """Batch sizes."""
+    repeats: Count = 20  # Timed runs of each stage.
     backend: options.Backend = "xla"
 
 
 def run(args: Benchmark) -> None:
     """Measure, print, and write the times."""
-    check_at_least(args, 1, "repeats")
-    check(min(args.batch, default=1) >= 1, "--batch", min(args.batch, default=1), "at least 1")
     files = find_clouds(args.files)
-    check_outputs(args.checkpoint, files, out=args.out)
     detector = load_detector(args.checkpoint, backend=args.backend)
     record = {
         "checkpoint": str(args.checkpoint),

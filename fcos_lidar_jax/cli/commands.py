@@ -1,12 +1,10 @@
 """All commands with their options."""
 
 import contextlib
-import dataclasses
 import io
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import reduce
 from operator import or_
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -23,7 +21,7 @@ from fcos_lidar_jax.cli import (
     synthesize,
     train,
 )
-from fcos_lidar_jax.files import local_path
+from fcos_lidar_jax.cli.checks import check_options
 
 _COMMANDS = {
     "demo": (demo.Demo, demo.run, "detect objects in a simulated drive; needs no data"),
@@ -53,20 +51,13 @@ def parse(argv: Sequence[str]) -> Callable[[], object]:
         raise ValueError(rejection)
     if command is None:
         command = _parse(argv)  # again, to print the help or the usage error
-    _check_paths(command)
     run = next(run for kind, run, _ in _COMMANDS.values() if isinstance(command, kind))
-    return partial(run, command)
 
+    def checked() -> None:
+        check_options(command)
+        run(command)
 
-def _check_paths(value: Any) -> None:
-    if isinstance(value, str | Path):
-        local_path(value)
-    elif isinstance(value, tuple):
-        for part in value:
-            _check_paths(part)
-    elif dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            _check_paths(getattr(value, field.name))
+    return checked
 
 
 def _parse(argv: Sequence[str]) -> Any:

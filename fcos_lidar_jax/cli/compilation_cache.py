@@ -25,8 +25,8 @@ _CPUINFO = r"(vendor_id|cpu family|model|model name|stepping|flags|Features|CPU 
 def use_compilation_cache() -> None:
     """Keep compiled programs in the user's cache folder, unless JAX is configured to use another folder or none.
 
-    JAX runs the code that it finds there. If others can write to the folder, or this process cannot, one line says
-    so, and there is no cache.
+    JAX runs the code that it finds there. If others can write to the folder, one line says so, and there is no
+    cache.
     """
     config: Any = jax.config
     if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
@@ -62,8 +62,6 @@ def _make_folder() -> Path:
         status = each.stat()
         if status.st_uid != os.geteuid() or status.st_mode & 0o022:
             raise PermissionError(f"{each}: belongs to another user, or others can write to it")
-        if not os.access(each, os.W_OK):
-            raise PermissionError(f"{each}: cannot be written to")
     return folder
 
 

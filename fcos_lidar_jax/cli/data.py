@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -144,12 +145,9 @@ def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]
     """
     indices: list[int] = []
     for part in text.split(","):
-        first, colon, last = part.partition(":")
-        numbers = bool(colon) and first.strip().isdecimal() and last.strip().isdecimal()
-        check(numbers, option, part, "FIRST:LAST")
-        new = range(int(first), int(last))
-        check(len(new) > 0 and int(last) <= number, option, part, f"FIRST < LAST within the {number} frames")
-        if set(new) & set(indices):
-            raise ValueError(f"{option}: {part!r} overlaps with another range of {text!r}")
+        ends = re.fullmatch(r"\s*(\d+)\s*:\s*(\d+)\s*", part)
+        new = range(int(ends[1]), int(ends[2])) if ends else range(0)
+        fits = len(new) > 0 and new.stop <= number and not set(new) & set(indices)
+        check(fits, option, part, f"FIRST:LAST with FIRST < LAST within the {number} frames, without overlap")
         indices += new
     return indices

@@ -3,17 +3,19 @@
 import dataclasses
 import time
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from fcos_lidar_jax.checkpoints.storage import shipped_checkpoints
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
+from fcos_lidar_jax.cli.checks import Output
 from fcos_lidar_jax.cli.scoring import Task, run_detector, write_reports, write_scores
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
 from fcos_lidar_jax.evaluation.metrics import Evaluation
 from fcos_lidar_jax.evaluation.truth import split_truth
+from fcos_lidar_jax.fields import Count, Natural
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.input_pipeline import open_frames
 from fcos_lidar_jax.progress import Progress, tell
@@ -40,16 +42,13 @@ class Demo:
     which plays the drive.
     """
 
-    out: Path = Path("demo_output")  # Folder for the results.
-    keyframes: int = 12  # Length of the drive in keyframes, half a second apart.
-    drive: int = 3  # Seed of the drive.
+    out: Annotated[Path, Output.FOLDER] = Path("demo_output")  # Folder for the results.
+    keyframes: Count = 12  # Length of the drive in keyframes, half a second apart.
+    drive: Natural = 3  # Seed of the drive.
 
 
 def run(args: Demo) -> None:
     """Simulate, evaluate and draw."""
-    check_at_least(args, 1, "keyframes")
-    check_at_least(args, 0, "drive")
-    check_out_folder(args.out)
     began = time.monotonic()
     tell(f"simulating a drive of {args.keyframes} keyframes")
     detector, title = load_detector(shipped_checkpoints()[WEIGHTS]), f"{WEIGHTS} on an unseen simulated drive"

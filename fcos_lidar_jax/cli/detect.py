@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,16 +12,9 @@ import msgspec
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import (
-    check_at_least,
-    check_out_file,
-    check_out_folder,
-    check_outputs,
-    check_outside,
-    check_score,
-)
+from fcos_lidar_jax.cli.checks import Excludes, Or, Output
 from fcos_lidar_jax.cli.options import alignment_of, option
-from fcos_lidar_jax.cli.sinks import check_result_files, check_results, open_sinks
+from fcos_lidar_jax.cli.sinks import check_results, open_sinks
 from fcos_lidar_jax.data.cloud_policy import truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import no_points
@@ -30,11 +23,11 @@ from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
-from fcos_lidar_jax.inference.prediction_log import log_of, write_predictions
+from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E
-from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
+_LISTED = Excludes(("files", "full_turn"), "the list names the files, which keep all points")
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
 
@@ -49,12 +42,12 @@ class Detect:
     removed since. A file that is given twice is processed once.
     """
 
-    files: tyro.conf.Positional[Annotated[tuple[Path, ...], option("INPUT", text=_INPUT)]]
+    files: tyro.conf.Positional[Annotated[tuple[Path, ...], Or("sweeps"), option("INPUT", text=_INPUT)]]
     checkpoint: options.Detector
-    out: Annotated[Path, option("FILE")]  # File to write.
+    out: Annotated[Path, Output.RESULT, option("FILE")]  # File to write.
     output_format: options.OutputFormat = "json"
     calibration: options.Calibration = None
-    sweeps: Annotated[Path | None, option("FILE.json")] = None
+    sweeps: Annotated[Path | None, _LISTED, option("FILE.json")] = None
     """Sweeps to fuse, instead of INPUT: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], newest first."""
     data_sensor: options.DataSensor = None
     yaw_deg: options.Yaw = None
@@ -63,7 +56,7 @@ class Detect:
     min_score: options.MinScore = None
     labels: options.Labels = None
     remove_close: options.Close = None
-    pictures: Annotated[Path | None, option("DIR")] = None
+    pictures: Annotated[Path | None, Output.FOLDER, option("DIR")] = None
     """Also draw every cloud with its boxes, in bird's-eye view."""
     page: options.Page = None
     rrd: options.Rrd = None
@@ -79,7 +72,6 @@ def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
     files, sweeps = _inputs(args)
     parts = [Path(sweep.file) for sweep in sweeps]
-    _check(args, [*files, *parts])
     detector = load_detector(args.checkpoint, backend=args.backend)
     classes, config = detector.classes, detector.config
     check_results(args, classes, posed=bool(sweeps), clouds=parts[:1] or files)
@@ -119,10 +111,6 @@ def run(args: Detect) -> None:
 
 def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
     """The files, each once; or the list of sweeps, and its entries with the paths of their files."""
-    if bool(args.files) == (args.sweeps is not None):
-        raise ValueError("detect: expected either point files or --sweeps")
-    if args.sweeps is not None and args.full_turn:
-        raise ValueError("--full-turn: expected none with --sweeps, which keeps all points")
     for file in args.files:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
@@ -138,18 +126,3 @@ def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
         raise ValueError(f"--sweeps: {args.sweeps}: expected a file that ends in .json")
     folder, sweeps = args.sweeps.parent, read_list(args.sweeps)
     return (args.sweeps,), [msgspec.structs.replace(each, file=str(folder / each.file)) for each in sweeps]
-
-
-def _check(args: Detect, read: Sequence[Path]) -> None:
-    """Check the options, and that no output replaces a file to read."""
-    check_at_least(args, 1, "batch_size", "max_file_points")
-    check_score(args)
-    log = log_of(args.out)
-    if args.rrd is not None:
-        check_rerun()
-    check_result_files(args, read)
-    check_out_file("--out", log, keep=read)
-    check_outputs(args.checkpoint, [*read, args.out, log], page=args.page, rrd=args.rrd)
-    if args.pictures is not None:
-        check_outside("--pictures", args.pictures, args.checkpoint)
-        check_out_folder(args.pictures, "--pictures")

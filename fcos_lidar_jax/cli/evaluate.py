@@ -12,13 +12,7 @@ import tyro
 from fcos_lidar_jax.checkpoints.preemption import take_sigterm_back
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import (
-    check_at_least,
-    check_out_file,
-    check_out_folder,
-    check_outside,
-    option_name,
-)
+from fcos_lidar_jax.cli.checks import Excludes, Or, Output, check_out_file, option_name
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
@@ -31,6 +25,7 @@ from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchm
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, score_kitti, write_summary
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
+from fcos_lidar_jax.fields import Natural
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.alignment import heading, other_rows
@@ -38,9 +33,14 @@ from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.visualization.evaluation_report import PAGE
-from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
 _TOO_HIGH = "scores on training frames are too high"
+_NO_DETECTION = Excludes(("backend", "batch_size", "yaw_deg", "distributed", "coordinator"), "nothing is detected")
+_NO_DATA = Excludes(
+    ("checkpoint", "data_root", "format", "class_map", "split", "samples"), "it takes the place of a data set"
+)
+_ONE_PROCESS = Excludes(("distributed", "coordinator"), "only xla runs in several processes")
+_WRITTEN = ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,25 +62,25 @@ class Evaluate:
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
-    out: Annotated[Path, option("DIR")]  # Folder for the metrics and the report.
+    out: Annotated[Path, Output.FOLDER, option("DIR")]  # Folder for the metrics and the report.
     split: Annotated[str | None, option("SPLIT", default="val, mini_val, or all frames without splits")] = None
     """Split to evaluate on."""
     samples: Annotated[str | None, option("FIRST:LAST,...", default="all")] = None
     """Ranges of the split's frames, LAST excluded."""
-    checkpoint: Annotated[Path | None, option("C", text=DETECTOR_TEXT)] = None
-    results: Annotated[Path | None, option("FILE|DIR")] = None
+    checkpoint: Annotated[Path | None, Or("results"), option("C", text=DETECTOR_TEXT)] = None
+    results: Annotated[Path | None, _NO_DETECTION, option("FILE|DIR")] = None
     """Results to evaluate: an official results file, detections.json with the --checkpoint it came from,
     or a folder of KITTI result files, one for each frame of the split."""
-    ground_truth: Annotated[Path | None, option("FILE")] = None
+    ground_truth: Annotated[Path | None, _NO_DATA, option("FILE")] = None
     """Ground truth instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
     yaw_deg: options.Yaw = None
     batch_size: options.BatchSize = 1
-    backend: options.Backend = "xla"
-    bootstrap: Annotated[int, option("N")] = 0
+    backend: Annotated[options.Backend, _ONE_PROCESS] = "xla"
+    bootstrap: Annotated[Natural, option("N")] = 0
     """Bootstrap samples for the 95 % intervals of mAP and NDS, such as 200; 0 for no intervals."""
     report: bool = True  # Write report.html with its pictures, and frames.html.
-    rrd: options.Rrd = None
-    sensor: Annotated[str, option("SENSOR")] = "nuscenes_hdl32e"
+    rrd: Annotated[options.Rrd, Excludes(("ground_truth",), "it has no points")] = None
+    sensor: Annotated[str, Excludes(("checkpoint",), "its sensor is used"), option("SENSOR")] = "nuscenes_hdl32e"
     """Without --checkpoint: sensor preset or sensor file for the range images of the report."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
     """Share the detection among several processes."""
@@ -88,7 +88,8 @@ class Evaluate:
 
 def run(args: Evaluate) -> None:
     """Detect if a detector is given, evaluate, write, and print the scores."""
-    _check(args)
+    check_processes(args.processes)
+    _check_written(args)
     if _has_kitti_results(args):
         return _score_kitti_results(args)
     join_processes(args.processes)
@@ -150,44 +151,11 @@ def _copy(args: Evaluate, task: Task) -> None:
         atomic_write(file, lambda path: shutil.copyfile(given, path))
 
 
-def _check(args: Evaluate) -> None:
-    if args.checkpoint is None and args.results is None:
-        raise ValueError("evaluate: expected --checkpoint or --results")
-    if args.ground_truth is not None:
-        if args.checkpoint is not None:
-            raise ValueError("--ground-truth: expected --results with it: a checkpoint needs --data-root")
-        if args.data != DataOptions() or args.split is not None or args.samples is not None:
-            raise ValueError("--ground-truth: expected no data set with it")
-    elif args.data.data_root is None and args.data.format is None:
-        raise ValueError("evaluate: expected --data-root, or --results with --ground-truth")
-    check_processes(args.processes)
-    if args.processes.several and args.results is not None:
-        raise ValueError("--results: got several processes, expected one, since nothing is detected")
-    if args.processes.several and args.backend != "xla":
-        raise ValueError(f"--backend: got {args.backend} with several processes, expected xla")
-    check_at_least(args, 1, "batch_size")
-    check_at_least(args, 0, "bootstrap")
-    radians(args.yaw_deg)  # refuses
-    for name in ("backend", "batch_size", "yaw_deg"):
-        if args.results is not None and (value := getattr(args, name)) != getattr(Evaluate, name):
-            raise ValueError(
-                f"{option_name(name)}: got {value}, expected none with --results, since nothing is detected"
-            )
-    check_out_folder(args.out)
-    if args.checkpoint is not None:
-        if args.sensor != Evaluate.sensor:
-            raise ValueError(f"--sensor: got {args.sensor}, expected none with --checkpoint: its sensor is used")
-        check_outside("--out", args.out, args.checkpoint)
-    if args.rrd is not None:
-        check_rerun()
-        check_out_file("--rrd", args.rrd, keep=[file for file in (args.results, args.ground_truth) if file])
-        if args.ground_truth is not None:
-            raise ValueError("--rrd: expected a data set: --ground-truth has no points")
-    inputs = [file for file in (args.results, args.ground_truth) if file is not None]
-    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY):
-        check_out_file("--out", args.out / name, keep=inputs)
-    for name in RESULT_FILES:  # --results may be in the folder already
-        check_out_file("--out", args.out / name, keep=[file for file in inputs if file is not args.results])
+def _check_written(args: Evaluate) -> None:
+    """Reject a folder in which a file would replace an input. The results may be in it already."""
+    for name in (*_WRITTEN, *RESULT_FILES):
+        inputs = (args.ground_truth, None if name in RESULT_FILES else args.results)
+        check_out_file("--out", args.out / name, keep=[file for file in inputs if file is not None])
 
 
 def _open(args: Evaluate) -> Task:
@@ -231,7 +199,8 @@ def _open(args: Evaluate) -> Task:
     truth = split_truth(frames.nuscenes, frames.tokens)
     comparison = compare_by_benchmark(truth, name, config.classes, frames)
     # Evaluating a results file needs only the tables.
-    if detector is None and args.report and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
+    only_boxes = detector is None and args.report and args.rrd is None
+    if only_boxes and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
         tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
         return Task(name, comparison, sensor)
     return Task(name, comparison, frames.sensor, detector, frames)

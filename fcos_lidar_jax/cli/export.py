@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_outputs
+from fcos_lidar_jax.cli.checks import Needs, Output
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import load_trained
@@ -26,27 +26,23 @@ class Export:
     """
 
     checkpoint: options.Trained
-    out: Annotated[Path, option("FILE")]  # File to write.
-    points: Annotated[Size | None, option("N|any", default="as trained")] = None
+    out: Annotated[Path, Output.FILE, option("FILE")]  # File to write.
+    points: Annotated[Size | None, Needs("format", "jax"), option("N|any", default="as trained")] = None
     """Rows of a cloud including padding; `any` compiles once per number of rows."""
-    batch: Annotated[Size, option("N|any")] = 1
+    batch: Annotated[Size, Needs("format", "jax"), option("N|any")] = 1
     """Clouds per call, or any number. Another size changes boxes and scores by rounding."""
-    network_only: bool = False  # Leave out projection, decoding and NMS. Needs --format onnx.
+    network_only: Annotated[bool, Needs("format", "onnx")] = False
+    """Leave out projection, decoding and NMS. Needs --format onnx."""
     format: Literal["jax", "onnx"] = "jax"  # A program of jax.export, or an ONNX graph.
 
 
 def run(args: Export) -> None:
     """Export the detector, write the file, and print a record of it."""
     checkpoint = find_checkpoint(args.checkpoint)
-    check_outputs(args.checkpoint, (), out=args.out)
-    if args.network_only and args.format != "onnx":
-        raise ValueError("--network-only: expected --format onnx: only the network's ONNX graph stands alone")
     (_export_onnx if args.format == "onnx" else _export_program)(args, checkpoint)
 
 
 def _export_onnx(args: Export, checkpoint: Path) -> None:
-    if (args.points, args.batch) != (None, 1):
-        raise ValueError("--points, --batch: expected without --format onnx")
     detector = load_trained(checkpoint)
     content = (network_graph if args.network_only else program_graph)(detector)
     atomic_write(args.out, lambda path: path.write_bytes(content))

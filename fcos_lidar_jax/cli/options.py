@@ -9,6 +9,8 @@ import tyro
 
 from fcos_lidar_jax import inference, sensors
 from fcos_lidar_jax.cli import sinks
+from fcos_lidar_jax.cli.checks import Needs, Output
+from fcos_lidar_jax.fields import Bounds, Count
 from fcos_lidar_jax.inference.alignment import Alignment, align
 from fcos_lidar_jax.progress import tell
 
@@ -44,7 +46,7 @@ Backend = Annotated[
     ),
 ]
 BatchSize = Annotated[
-    int, option(text="Clouds per device and call. Another size changes boxes and scores by rounding.")
+    Count, option(text="Clouds per device and call. Another size changes boxes and scores by rounding.")
 ]
 Close = Annotated[
     Literal["all", "sweeps", "none"] | None,
@@ -63,9 +65,10 @@ Dtype = Annotated[
     option("{float16,float32,float64}", default="float32", text=f"Number type {_RAW}."),
 ]
 Viewpoint = Annotated[bool, option(text="Move the points of .pcd files by the VIEWPOINT of their headers.")]
-MaxFilePoints = Annotated[int, option(text="Refuse point files with more points than this.")]
+MaxFilePoints = Annotated[Count, option(text="Refuse point files with more points than this.")]
+Score = Annotated[float | None, Bounds(0, 1)]
 MinScore = Annotated[
-    float | None,
+    Score,
     option(
         "SCORE",
         default="0 in files; pictures, pages and recordings show boxes from 0.3",
@@ -84,6 +87,7 @@ OutputFormat = Annotated[
 ]
 Calibration = Annotated[
     Path | None,
+    Needs("output_format", "kitti"),
     option(
         "PATH",
         default="calib beside the folder of the clouds",
@@ -92,13 +96,16 @@ Calibration = Annotated[
 ]
 Rrd = Annotated[
     Path | None,
+    Output.FILE,
     option(
         "FILE.rrd",
         text="Also write a recording for the Rerun viewer. Needs pip install -e '.[viz]' in the repository.",
     ),
 ]
 Page = Annotated[
-    Path | None, option("FILE.html", text="Also write a page for a browser, one file that works offline.")
+    Path | None,
+    Output.FILE,
+    option("FILE.html", text="Also write a page for a browser, one file that works offline."),
 ]
 Sensor = Annotated[str, option("SENSOR", text="Sensor preset, or a sensor file.")]
 DataSensor = Annotated[
@@ -112,6 +119,7 @@ DataSensor = Annotated[
 ]
 Yaw = Annotated[
     float | None,
+    Bounds(-360, 360),
     option(
         "DEGREES",
         default="the angle between the headings of the two sensors, if known",
@@ -132,8 +140,6 @@ FullTurn = Annotated[
 
 def radians(degrees: float | None) -> float | None:
     """The angle of ``yaw_deg`` in radians; None stays None."""
-    if degrees is not None and not math.isfinite(degrees):
-        raise ValueError(f"--yaw-deg: got {degrees:g}, expected an angle in degrees")
     if degrees and abs(degrees - (octants := round(degrees * 4 / math.pi)) * math.pi / 4) < 0.005:
         tell(f"note: --yaw-deg {degrees:g} is in degrees; are {45 * octants} meant?", once=True)
     return None if degrees is None else math.radians(degrees)

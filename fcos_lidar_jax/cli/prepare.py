@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
+from fcos_lidar_jax.cli.checks import check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
@@ -19,6 +19,7 @@ from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import SampleAnnotation, Scene, read_table
+from fcos_lidar_jax.fields import Count
 from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
@@ -40,15 +41,14 @@ class Prepare:
         str | None, option("SPLIT", default="train, mini_train, or all frames without splits")
     ] = None
     """Split to extract objects from. A nuScenes version without annotations only gets an index."""
-    num_sweeps: int = NUSCENES.num_sweeps  # Sweeps per object, if the data have sweeps.
-    min_points: int = CopyPasteConfig().min_points
+    num_sweeps: Count = NUSCENES.num_sweeps  # Sweeps per object, if the data have sweeps.
+    min_points: Count = CopyPasteConfig().min_points
     """Minimum number of points of an object in all its sweeps; --copy-paste.min-points of train may be higher."""
-    workers: int = 1  # Processes that extract objects.
+    workers: Count = 1  # Processes that extract objects.
 
 
 def run(args: Prepare) -> None:
     """Build the index and the database, and print a record of them."""
-    check_at_least(args, 1, "workers", "num_sweeps", "min_points")
     data, began = args.data.data_set, time.monotonic()
     if not data.on_disk:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")

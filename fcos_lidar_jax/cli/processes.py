@@ -7,7 +7,7 @@ from typing import Annotated
 
 import jax
 
-from fcos_lidar_jax.cli.checks import check_at_least
+from fcos_lidar_jax.cli.checks import Needs
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.devices.launcher import local_device_ids
 from fcos_lidar_jax.fields import check
@@ -18,10 +18,11 @@ class ProcessOptions:
     """Options that connect several processes."""
 
     distributed: bool = False  # Connect to the other processes that Slurm, Open MPI or a TPU pod has started.
-    coordinator: Annotated[str | None, option("HOST:PORT")] = None
+    coordinator: Annotated[str | None, Needs("num_processes"), option("HOST:PORT")] = None
     """Address of process 0, without a launcher. Needs --num-processes and --process-index."""
-    num_processes: Annotated[int | None, option("N")] = None  # Number of processes.
-    process_index: Annotated[int | None, option("I")] = None  # Index of this process, from 0.
+    num_processes: Annotated[int | None, Needs("process_index"), option("N")] = None  # Number of processes.
+    process_index: Annotated[int | None, Needs("coordinator"), option("I")] = None
+    """Index of this process, from 0."""
 
     @property
     def several(self) -> bool:
@@ -31,10 +32,6 @@ class ProcessOptions:
 
 def check_processes(options: ProcessOptions) -> None:
     """Raise ValueError for options that do not describe a process of a cluster."""
-    check_at_least(options, 1, "num_processes")
-    given = [value is not None for value in (options.coordinator, options.num_processes, options.process_index)]
-    if any(given) and not all(given):
-        raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
     index, number = options.process_index, options.num_processes or 0
     check(index is None or 0 <= index < number, "--process-index", index, f"0 to {number} excluded")
     if options.coordinator is not None:

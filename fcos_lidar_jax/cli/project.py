@@ -10,12 +10,12 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
+from fcos_lidar_jax.cli.checks import Output
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
 from fcos_lidar_jax.data.cloud_policy import make_cloud, no_usable_points, sensor_mismatch
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
-from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.fields import Bounds
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import project_points
@@ -31,10 +31,11 @@ class Project:
     """
 
     file: tyro.conf.Positional[Annotated[Path, option("FILE", text=f"Point file: {', '.join(ENDINGS)}.")]]
-    out: Annotated[Path, option("FILE.npz")]  # File for the range image.
-    png: Annotated[Path | None, option("FILE.png")] = None  # Also draw the range image, one panel per round.
+    out: Annotated[Path, Output.FILE, option("FILE.npz")]  # File for the range image.
+    png: Annotated[Path | None, Output.FILE, option("FILE.png")] = None
+    """Also draw the range image, one panel per round."""
     sensor: options.Sensor = "nuscenes_hdl32e"
-    rounds: int = 5  # Rounds of the projection.
+    rounds: Annotated[int, Bounds(1, MAX_ROUNDS)] = 5  # Rounds of the projection.
     prioritize_current: bool = True  # Let points of the current sweep win every collision with older points.
     remove_close: Literal["all", "sweeps", "none"] = ProjectionConfig.remove_close
     """Drop points within a metre of the sensor in x and y: all sweeps, only older sweeps, or none."""
@@ -46,11 +47,6 @@ class Project:
 
 def run(args: Project) -> None:
     """Project the file, write the image, and print the counts."""
-    check_at_least(args, 1, "rounds", "max_file_points")
-    check(args.rounds <= MAX_ROUNDS, "--rounds", args.rounds, f"at most {MAX_ROUNDS}")
-    check_out_file("--out", args.out, keep=[args.file])
-    if args.png is not None:
-        check_out_file("--png", args.png, keep=[args.file, args.out])
     sensor = load_sensor(args.sensor)
     layout = {name: getattr(args, name) for name in ("columns", "dtype", "viewpoint")}
     limit, num_sweeps = args.max_file_points, Config.num_sweeps

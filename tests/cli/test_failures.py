@@ -13,12 +13,10 @@ from commands import assert_one_line_error, child_environment, run_python
 from refusal import refused
 
 import fcos_lidar_jax as fcos
-from fcos_lidar_jax.checkpoints import load_checkpoint
 from fcos_lidar_jax.cli import exit_code, main
 from fcos_lidar_jax.cli.commands import _COMMANDS
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.files import atomic_write, folder_lock, local_path
-from fcos_lidar_jax.input_pipeline.open import find_data_set
+from fcos_lidar_jax.files import folder_lock, local_path
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -97,9 +95,7 @@ PLATFORM = "expected a platform of this machine, or, for NVIDIA GPUs, pip instal
             *("JAX_TRANSFER_GUARD", "disallow", RuntimeError("Disallowed host-to-device transfer")),
             "the environment has JAX_TRANSFER_GUARD=disallow, which makes JAX refuse more than usual: Disallowed",
         ),
-        ("JAX_NO_EXECUTION", "1", RuntimeError("no_execution"), "the environment has JAX_NO_EXECUTION=1, which"),
         ("JAX_DEBUG_NANS", "1", FloatingPointError("nan in jit"), "the environment has JAX_DEBUG_NANS=1, which"),
-        ("JAX_CHECK_TRACER_LEAKS", "1", Exception("leak"), "the environment has JAX_CHECK_TRACER_LEAKS=1, which"),
         ("JAX_DEBUG_NANS", "1", ValueError("a.npy: no such file"), "a.npy: no such file"),
     ],
 )
@@ -112,32 +108,21 @@ def test_what_the_environment_of_jax_breaks_is_no_bug(capsys, monkeypatch, name,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("environment", "message"),
-    [
-        ({"JAX_PLATFORMS": "abacus"}, f"JAX_PLATFORMS: got 'abacus', {PLATFORM}"),
-        ({"JAX_PLATFORMS": "cuda", "CUDA_VISIBLE_DEVICES": ""}, f"JAX_PLATFORMS: got 'cuda', {PLATFORM}"),
-        ({"JAX_TRANSFER_GUARD": "disallow"}, "the environment has JAX_TRANSFER_GUARD=disallow, which makes JAX"),
-    ],
-)
-def test_an_unusable_environment_is_one_line(tmp_path, environment, message):
+def test_an_unusable_environment_is_one_line(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((9, 4)))
     words = ["project", tmp_path / "a.npy", "--out", tmp_path / "a.npz"]
-    done = run_python("-m", "fcos_lidar_jax", *words, **environment)
+    done = run_python("-m", "fcos_lidar_jax", *words, JAX_PLATFORMS="cuda", CUDA_VISIBLE_DEVICES="")
     assert done.returncode == 1
-    assert done.stderr.startswith(f"fcos-lidar: error: {message}")
+    assert done.stderr.startswith(f"fcos-lidar: error: JAX_PLATFORMS: got 'cuda', {PLATFORM}")
     assert done.stderr.count("\n") == 1
 
 
-def test_absurd_numbers_and_deep_files_are_one_line(tmp_path, capsys):
+def test_deep_files_are_one_line(tmp_path, capsys):
     np.save(tmp_path / "a.npy", np.ones((9, 4)))
     project = ["project", str(tmp_path / "a.npy"), "--out", str(tmp_path / "a.npz")]
-    assert_one_line_error(capsys, [*project, "--rounds", "100000"], "--rounds: got 100000, expected at most 100")
     (tmp_path / "deep.json").write_text("[" * 100_000)
     deep = str(tmp_path / "deep.json")
     assert_one_line_error(capsys, [*project, "--sensor", deep], "deep.json: not JSON")
-    data = ["evaluate", "--checkpoint", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out")]
-    assert_one_line_error(capsys, [*data, "--class-map", deep], "deep.json: not JSON")
 
 
 TERMINATED = """
@@ -183,8 +168,9 @@ sys.exit(cli.exit_code("program", work))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize(("work", "times"), [("compiles", 1), ("saves", 3)])
+@pytest.mark.parametrize(
+    ("work", "times", "number"), [("compiles", 1, signal.SIGTERM), ("saves", 3, signal.SIGINT)]
+)
 def test_signals_end_the_process_while_c_code_blocks_the_main_thread(work, times, number):
     """The first one, or while a run is to be saved, the second; `timeout` sends the same one twice at once."""
     words = [sys.executable, "-c", BLOCKED, work]
@@ -194,8 +180,7 @@ def test_signals_end_the_process_while_c_code_blocks_the_main_thread(work, times
             for sent in range(times):
                 process.send_signal(number)
                 if work == "saves" and sent == 0:
-                    again = "; press Ctrl-C again to stop now, without saving" if number == signal.SIGINT else ""
-                    assert process.stderr.readline() == f"saving{again}\n"
+                    assert process.stderr.readline() == "saving; press Ctrl-C again to stop now, without saving\n"
                 elif sent < times - 1:
                     with pytest.raises(subprocess.TimeoutExpired):
                         process.wait(0.5)
@@ -220,21 +205,19 @@ C_LOCALE = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variables", [{"PYTHONIOENCODING": "ascii"}, C_LOCALE], ids=["encoding", "locale"])
-def test_helps_and_errors_are_shown_on_a_terminal_without_unicode(variables):
+def test_helps_and_errors_are_shown_on_a_terminal_without_unicode():
     helps = [[*words, "--help"] for words in ([], *([name] for name in _COMMANDS))]
-    done = run_python("-c", ALL, json.dumps([*helps, ["detect", "--grösse"], ["project", "grösse"]]), **variables)
+    done = run_python("-c", ALL, json.dumps([*helps, ["detect", "--grösse"], ["project", "grösse"]]), **C_LOCALE)
     assert json.loads(done.stdout.splitlines()[-1]) == [0] * len(helps) + [2, 2], done.stderr
     assert "? quickstart " in done.stdout
     assert "--gr" in done.stdout + done.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_closed_output_pipe_ends_in_silence(unbuffered):
     read, write = os.pipe()
     os.close(read)
-    words = [sys.executable, "-m", "fcos_lidar_jax", "--help"]
+    words = [sys.executable, "-c", "from fcos_lidar_jax.cli import main; raise SystemExit(main(['--version']))"]
     streams = {"stdout": write, "stderr": subprocess.PIPE, "text": True}
     environment = child_environment(PYTHONUNBUFFERED=unbuffered)
     done = subprocess.run(words, env=environment, check=False, **streams)
@@ -266,17 +249,10 @@ URL_HINT = "got a URL, expected a path: copy the files (gsutil, aws s3) or mount
     "words",
     [
         "train quickstart --format simulated --out gs://b/run",
-        "train quickstart --format simulated --out run --weights gs://b/run",
         "train quickstart --data-root gs://b/run --out run",
-        "prepare --data-root run --index gs://b/run",
-        "evaluate --data-root run --checkpoint quickstart --out gs://b/run",
         "detect a.bin gs://b/run --checkpoint quickstart --out boxes.json",
-        "detect a.bin --checkpoint quickstart --out gs://b/run",
-        "stream run --checkpoint quickstart --out boxes.jsonl --page gs://b/run",
         "project a.bin --out a.npz --sensor gs://b/run",
         "export --checkpoint gs://b/run --out a",
-        "synthesize --scenes 1 --out gs://b/run",
-        "benchmark --checkpoint quickstart --out=gs://b/run",
         "demo --out gs:/b/run",
     ],
 )
@@ -291,21 +267,16 @@ FRONT_DOORS = {
     "train": lambda url: fcos.train(QUICKSTART, SimulatedFrames(TINY, 2), url, steps=1),
     "load_detector": lambda url: fcos.load_detector(url),
     "open_frames": lambda url: fcos.open_frames(url),
-    "splits": lambda url: fcos.open_frames(".", format="folder", splits=url),
-    "find_data_set": lambda url: find_data_set(url),
     "read_points": lambda url: read_points(f"{url}/a.bin", TINY),
-    "load_checkpoint": lambda url: load_checkpoint(url),
-    "atomic_write": lambda url: atomic_write(url, lambda path: path.write_text("")),
     "folder_lock": lambda url: folder_lock(Path(url), "training").__enter__(),
 }
 
 
 @pytest.mark.parametrize("door", FRONT_DOORS)
-@pytest.mark.parametrize("scheme", ["gs", "s3"])
-def test_a_url_is_refused_by_every_function(door, scheme, tmp_path, monkeypatch):
+def test_a_url_is_refused_by_every_function(door, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with refused(f"{scheme}://b/run", URL_HINT):
-        FRONT_DOORS[door](f"{scheme}://b/run")
+    with refused("s3://b/run", URL_HINT):
+        FRONT_DOORS[door]("s3://b/run")
     assert list(tmp_path.iterdir()) == []
 
 

