@@ -35,9 +35,10 @@ def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...],
         shape, fortran, dtype = read_header(stream)
     except Exception as error:  # damaged headers raise arbitrary exceptions, even the tokenizer's
         raise ValueError(" ".join(str(error).split())) from None
-    if dtype.hasobject or (max_rows is not None and shape and shape[0] > max_rows):
-        limit = "" if max_rows is None else f" of at most {max_rows} rows"
-        raise ValueError(f"got {dtype} of shape {shape}, expected an array without pickled objects{limit}")
+    if dtype.hasobject:
+        raise ValueError("got pickled objects, expected an array without pickled objects")
+    if max_rows is not None and shape and shape[0] > max_rows:
+        raise ValueError(f"got {shape[0]} points, expected at most {max_rows}")
     return shape, fortran, dtype, stream.tell()
 
 

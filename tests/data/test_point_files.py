@@ -373,7 +373,7 @@ BAD = {
     "pickled.npz": ({"points": np.array([{"a": 1}], object)}, "without pickled objects"),
     "truncated.npy": (NPY[:-7], "not a readable .npy file: got 633 bytes of values, expected 640"),
     "header.npy": (npy_header((9, 4)).replace(b"}", b","), "not a readable .npy file"),
-    "huge.npy": (npy_header((2 * 10**13, 4)), "of at most 10000000 rows"),
+    "huge.npy": (npy_header((2 * 10**13, 4)), "got 20000000000000 points, expected at most 10000000"),
     "wrapping.npy": (npy_header((4, 2**62)), "got 0 bytes of values, expected 73786976294838206464"),
     "negative.npy": (npy_header((-4, -4)) + bytes(64), "for (-4, -4) of float32"),
     "bomb.npz": (with_size(zipped(zipfile.ZIP_DEFLATED), 3 * 2**30), "got 3221225472 bytes, compressed by"),
