@@ -89,13 +89,9 @@ def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:
         if not path.is_dir():
             clouds.append(path)
             continue
-        files = _point_files(path.iterdir())
+        visible = (file for file in path.iterdir() if file.is_file() and not file.name.startswith("."))
+        files = sorted(file for file in visible if file.name.lower().endswith(ENDINGS))
         if not files:
             raise ValueError(f"{path}: no point file in it, expected {', '.join(ENDINGS)}")
         clouds += files
     return tuple(clouds)
-
-
-def _point_files(paths: Iterable[Path]) -> list[Path]:
-    visible = (path for path in paths if not path.name.startswith("."))
-    return sorted(path for path in visible if path.is_file() and path.name.lower().endswith(ENDINGS))

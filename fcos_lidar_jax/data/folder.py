@@ -25,7 +25,7 @@ from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.progress import tell
-from fcos_lidar_jax.sensors import PRESETS, Sensor, load_sensor
+from fcos_lidar_jax.sensors import Sensor, load_sensor
 
 _SENSOR, _CLASSES = "sensor.json", "classes.json"
 _CLOUDS, _BOXES, _SWEEPS = "clouds", "boxes", "sweeps"
@@ -78,8 +78,6 @@ class FolderFrames(FrameSet):
         self._boxes = _list_files(root, _BOXES, (".json",), self._inside)
         listed = (root / _SWEEPS).exists()
         self._sweeps = _list_files(root, _SWEEPS, (".json",), self._inside) if listed else {}
-        if not self._clouds:
-            raise ValueError(f"{root / _CLOUDS}: no point file in it, expected at least one")
         for files in (self._boxes, self._sweeps):
             for name in sorted(files.keys() - self._clouds.keys()):
                 raise ValueError(f"{files[name]}: no cloud named {name} in {root / _CLOUDS}, expected one")
@@ -177,7 +175,7 @@ class FolderFrames(FrameSet):
         file = self.root / _CLASSES
         classes: list[str] | dict[str, str | None] = {}
         if os.path.lexists(file):
-            _expect_file(file, self._inside, str(file))
+            _expect_inside(file, self._inside, str(file))
             classes = read_json(file, list[str] | dict[str, str | None])
         if isinstance(classes, list):
             if not classes or len(set(classes)) < len(classes):
@@ -210,12 +208,11 @@ def belongs_to_own_data(path: Path) -> bool:
 
 def _list_files(root: Path, folder: str, endings: tuple[str, ...], inside: Path | None) -> dict[str, Path]:
     """Name without extension -> file; hidden files are skipped."""
-    if not (root / folder).is_dir():
-        raise ValueError(f"{root / folder}: no such folder, expected one with {', '.join(endings)} files")
-    files: dict[str, Path] = {}
-    for file in sorted((root / folder).iterdir()):
-        if file.name.startswith("."):
-            continue
+    place, files = root / folder, dict[str, Path]()
+    visible = [file for file in place.iterdir() if not file.name.startswith(".")] if place.is_dir() else []
+    if not visible and folder != _SWEEPS:
+        raise ValueError(f"{place}: found no file, expected a folder of {', '.join(endings)} files")
+    for file in sorted(visible):
         ending = next((e for e in endings if file.name.lower().endswith(e)), None)
         if ending is None:
             raise ValueError(f"{file}: unknown extension {file.suffix!r}, expected {', '.join(endings)}")
@@ -231,6 +228,10 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
     """Refuse a missing file, and one that a link or ``..`` leads out of the folder ``inside``."""
     if not os.path.isfile(file):
         raise ValueError(f"{where}: no such file" + ("" if where == str(file) else f": {file}"))
+    _expect_inside(file, inside, where)
+
+
+def _expect_inside(file: Path, inside: Path | None, where: str) -> None:
     if inside is not None:
         point_files.check_inside(file, inside, where)
 
@@ -238,10 +239,7 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
 def read_sensor(root: Path, inside: Path | None = None) -> Sensor:
     """Read ``sensor.json`` of a folder, which no link may lead out of the folder ``inside``."""
     file = root / _SENSOR
-    if not os.path.lexists(file):
-        names = ", ".join(f'"{name}"' for name in PRESETS)
-        raise ValueError(f"{file}: no such file, expected the fields of the LiDAR, or its name in quotes: {names}")
-    _expect_file(file, inside, str(file))
+    _expect_inside(file, inside, str(file))
     return load_sensor(file)
 
 

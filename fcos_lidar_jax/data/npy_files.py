@@ -30,11 +30,9 @@ def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...],
     """Shape, Fortran order, type and offset of the values, from the first bytes of a file."""
     stream = io.BytesIO(content)
     try:
-        version = np.lib.format.read_magic(stream)
-        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        if version not in read_header:
-            raise ValueError(f"version: got {version}, expected 1.0 or 2.0")
-        shape, fortran, dtype = read_header[version](stream)
+        first = np.lib.format.read_magic(stream) == (1, 0)  # later versions differ only in names of fields
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read_header(stream)
     except Exception as error:  # damaged headers raise arbitrary exceptions, even the tokenizer's
         raise ValueError(" ".join(str(error).split())) from None
     if dtype.hasobject:
@@ -64,10 +62,9 @@ def parse_npz(
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, max_rows: int | None, max_bytes: int) -> bytes:
-    if member.file_size > max_bytes:
-        raise ValueError(f"got {member.file_size} bytes unpacked, expected at most {max_bytes}")
-    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError("got another compression, expected none or deflate")
+    if member.file_size > max_bytes or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        found = f"{member.file_size} bytes, compressed by method {member.compress_type}"
+        raise ValueError(f"got {found}, expected at most {max_bytes}, stored or deflated")
     with archive.open(member) as stream:
         head = stream.read(_HEADER_BYTES)
         _read_header(head, max_rows)  # before the rest is unpacked

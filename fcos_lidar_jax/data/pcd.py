@@ -47,8 +47,10 @@ def parse_pcd(
     try:
         fields, number = _read_fields(header), _num_points(header)
         places = find_columns([field.name for field in fields], where)
-        if any(fields[place].count != 1 for place in places.values()) or number < 0:
-            raise ValueError("expected one value per column and point")
+        single = all(fields[place].count == 1 for place in places.values())
+        if not single or any(field.count < 1 for field in fields) or number < 0:
+            found = f"{' '.join(header.get('COUNT', []))[:200]} and {number}"
+            raise ValueError(f"COUNT and POINTS: got {found}, expected one value per column and point")
         read = _FORMS[" ".join(header["DATA"]).lower()]
         pose = _read_viewpoint(header, where, needed=viewpoint)
     except (KeyError, TypeError, ValueError) as error:
@@ -122,13 +124,10 @@ def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
         raise ValueError(f"FIELDS: got {' '.join(names)}, expected x, y and z, each once")
     each = zip(("SIZE", "TYPE", "COUNT"), "4F1", strict=True)  # defaults of old files, as in PCL
     sizes, kinds, counts = (header.get(entry, [default] * len(names)) for entry, default in each)
-    fields = [
+    return [
         _Field(name, np.dtype(f"<{_KINDS[kind.upper()]}{_SIZES[size]}"), int(count))
         for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True)
     ]
-    if any(field.count < 1 for field in fields):
-        raise ValueError(f"COUNT: got {' '.join(counts)}, expected at least 1 each")
-    return fields
 
 
 def _num_points(header: dict[str, list[str]]) -> int:

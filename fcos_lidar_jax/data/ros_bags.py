@@ -119,8 +119,6 @@ class _Bag(contextlib.AbstractContextManager):
         except ImportError:
             how = "pip install -e '.[ros]' in the repository"
             raise ValueError(f"{path}: rosbags is not installed, which reads recordings: {how}") from None
-        if not path.exists():
-            raise ValueError(f"{path}: no such file or folder, expected a recording")
         files = [path, *path.iterdir()] if path.is_dir() else [path]
         if odd := [file for file in files if file.suffix == ".db3" and set("%?#") & set(str(file))]:
             raise ValueError(f"{printable(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")

@@ -124,11 +124,9 @@ def read_entries(path: Path) -> list[ListedSweep]:
     sweeps = read_json(path, Annotated[list[ListedSweep], msgspec.Meta(min_length=1)], what="sweeps")
     for index, sweep in enumerate(sweeps):
         where, pose = f"{path}: $[{index}]", np.array(sweep.sensor_to_world)
-        if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
-            found = sweep.sensor_to_world[3]
-            raise ValueError(f"{where}.sensor_to_world: last row: got {found}, expected (0, 0, 0, 1)")
-        if not is_rotation(pose[:3, :3]):
-            raise ValueError(f"{where}.sensor_to_world: the upper left 3x3 is not a rotation")
+        if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6 or not is_rotation(pose[:3, :3]):
+            expected = "a rotation in the upper left 3x3, and 0, 0, 0, 1 as the last row"
+            raise ValueError(f"{where}.sensor_to_world: got {pose.tolist()}, expected {expected}")
     return sweeps
 
 

@@ -19,8 +19,6 @@ def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
         raise ValueError(f"{file}: no such file, expected {what}")
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()  # Windows editors write a byte order mark
-    except OSError as error:
-        raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{file}: got {error.reason} at byte {error.start}, expected {what}") from None
     rows = ((f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1))

@@ -98,7 +98,7 @@ def test_an_index_is_refused_where_it_would_be_ignored_or_spoil_the_data(tmp_pat
     assert_one_line_error(capsys, spoilt, "--index: .*clouds: a folder of own data, expected another one")
     more = f"--data-root {data} --out {tmp_path}/out --index {tmp_path}/index"
     train = f"train quickstart {more} --steps 1 --no-copy-paste --classes".split()
-    assert_one_line_error(capsys, [*train, *CLASSES], "--index: got .*, expected none: no prepared objects are used")
+    assert_one_line_error(capsys, [*train, *CLASSES], "--index: got .*, expected none: no prepared objects")
     evaluate = f"evaluate {more} --checkpoint quickstart".split()
     assert_one_line_error(capsys, evaluate, "--index: got .*, expected none: only the tables of nuScenes have an")
     assert [path.name for path in tmp_path.iterdir()] == ["data"]

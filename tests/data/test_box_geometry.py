@@ -65,13 +65,13 @@ def test_touching_boxes_do_not_overlap(other, expected):
 def test_points_in_boxes_equal_a_test_of_every_pair(reach_m):
     rng = np.random.default_rng(1)
     boxes = oracles.random_boxes(rng, 25, reach_m)
-    points = rng.uniform(-reach_m, reach_m, (3000, 5)).astype(np.float32)
-    points[:1500, :3] = np.repeat(boxes[:, :3], 60, 0) + rng.normal(0, 1, (1500, 3))
+    points = rng.uniform(-reach_m, reach_m, (1000, 5)).astype(np.float32)
+    points[:500, :3] = np.repeat(boxes[:, :3], 20, 0) + rng.normal(0, 1, (500, 3))
     points[7, 0], points[8, 1], points[9, 2] = np.nan, np.inf, -np.inf
     found = points_in_boxes(points, boxes)
     expected = [[i for i, p in enumerate(points[:, :3]) if oracles.inside(p, b)] for b in boxes.astype(np.float64)]
     assert [f.tolist() for f in found] == expected
-    assert sum(map(len, found)) > 300
+    assert sum(map(len, found)) > 80
 
 
 def test_points_on_the_boundary_are_inside_and_inputs_may_be_empty():

@@ -53,12 +53,6 @@ def test_frames_of_a_folder_are_sorted_by_name(root):
     assert frames.labels(1).tolist() == [0]  # without the points
 
 
-def test_close_points_are_removed_as_configured(root):
-    readings = (CloudReading(10, "all"), CloudReading(10, "none"), CloudReading(10), CloudReading(10, "all", 9.0))
-    read = [FolderFrames(root, reading=reading).frame(1) for reading in readings]
-    assert [(len(frame.points), frame.num_close) for frame in read] == [(3, 1), (4, 0), (4, 0), (0, 4)]
-
-
 def test_the_sensor_can_be_a_preset_or_an_argument(root):
     write(root / "sensor.json", '"kitti_hdl64e"')
     assert FolderFrames(root, reading=ALL).sensor is KITTI_HDL64E
@@ -174,64 +168,34 @@ def box_with(**values):
     return {"boxes": [CAR, {**CAR, "box": list(box.values())}]}
 
 
-B = "boxes/b.json"
-BAD_BOXES = {
-    "truncated": ('{"boxes": [', "not JSON: Expecting value: line 1 column 12"),
-    "not UTF-8": (b'{"boxes": "\xff"}', "not JSON: 'utf-8' codec"),
-    "nested": ("[" * 100_000, "not JSON: maximum recursion"),
-    "a bare list": ([], "$: got [], expected object"),
-    "no boxes": ({}, "$: Object missing required field `boxes`, got {}"),
-    "unknown key": ({"boxes": [], "num": 3}, "unknown field `num`, got {'boxes': [], 'num': 3}"),
-    "unknown key of a box": ({"boxes": [CAR, {**CAR, "x": 1}]}, "$.boxes[1]: Object contains unknown field `x`"),
-    "no label": ({"boxes": [{"box": CAR["box"]}]}, "$.boxes[0]: Object missing required field `label`"),
-    "label": ({"boxes": [{**CAR, "label": 3}]}, "$.boxes[0].label: got 3, expected str"),
-    "short": ({"boxes": [{**CAR, "box": [1, 2, 3]}]}, "$.boxes[0].box: got [1, 2, 3], expected array of length 9"),
-    "text": (box_with(w="2"), "$.boxes[1].box[4]: got '2', expected float"),
-    "null centre": (box_with(y=None), "$.boxes[1].box[1]: got None, expected float"),
-    "NaN": (box_with(yaw=np.nan), "$.boxes[1].box: yaw: got nan, expected a finite number"),
-    "NaN velocity": (box_with(vx=np.nan, vy=np.nan), "$.boxes[1].box[7]: got nan, expected fl"),
-    "absurd speed": (box_with(vx=-501), "$.boxes[1].box[7]: got -501, expected float >= -500.0"),
-}
+B, C = "boxes/b.json", "clouds/c.npy"
 
 
-def read_all(root: Path) -> None:
-    frames = FolderFrames(root, reading=ALL)
-    for index in range(len(frames)):
-        frames.frame(index)
-
-
-def link(root: Path, target: str) -> None:
-    (root / "clouds" / "c.npy").symlink_to(target)
+def holding(content):
+    return lambda root: write(root / B, content)
 
 
 BAD = {
     "no boxes": (lambda r: (r / B).unlink(), "clouds/b.npy", "b.json, expected one for every cloud"),
     "orphan": (lambda r: write(r / "boxes/c.json", {"boxes": []}), "boxes/c.json", "no cloud named c in"),
-    "empty list": (lambda r: write(r / "sweeps/b.json", []), "sweeps/b.json", "$: got [], expected array of len"),
-    "orphan list": (lambda r: write(r / "sweeps/c.json", []), "sweeps/c.json", "no cloud named c in"),
     "same name": (lambda r: write(r / "clouds/b.pcd", ""), "clouds/b.pcd", "a second file named b beside b.npy"),
     "extension": (lambda r: write(r / "clouds/b.txt", ""), "clouds/b.txt", "unknown extension '.txt', expected"),
-    "folder": (lambda r: (r / "boxes/c.json").mkdir(), "boxes/c.json", "no such file"),
-    "link outside": (lambda r: link(r, "../../secret.npy"), "clouds/c.npy", "secret.npy, expected a file inside"),
-    "link to itself": (lambda r: link(r, "c.npy"), "clouds/c.npy", "no such file"),
-    "empty": (lambda r: [file.unlink() for file in (r / "clouds").iterdir()], "clouds", "no point file in it"),
-    "no folder": (lambda r: (r / "boxes").rename(r / "box"), "boxes", "no such folder"),
-    "sensor": (
-        lambda r: write(r / "sensor.json", {"name": "mine", "num_columns": 8}),
-        "sensor.json",
-        "sensor.json: inclinations_deg, inclinations_rad: missing, expected one of them",
-    ),
+    "link outside": (lambda r: (r / C).symlink_to("../../secret.npy"), C, "secret.npy, expected a file inside"),
+    "link to itself": (lambda r: (r / C).symlink_to("c.npy"), C, "no such file"),
+    "empty": (lambda r: [file.unlink() for file in (r / "clouds").iterdir()], "clouds", "found no file, expected"),
+    "no folder": (lambda r: (r / "boxes").rename(r / "box"), "boxes", "found no file, expected a folder of .json"),
     "no sensor": (
         lambda r: (r / "sensor.json").unlink(),
         "sensor.json",
-        'no such file, expected the fields of the LiDAR, or its name in quotes: "',
+        "no such sensor file, and no preset (nusc",
     ),
-    "preset": (lambda r: write(r / "sensor.json", '"tinny"'), "sensor.json", "got 'tinny', expected tiny"),
     "class": (lambda r: write(r / "classes.json", ["carr"]), B, "$.boxes[0].label: got 'car', expected carr"),
     "class twice": (lambda r: write(r / "classes.json", ["car", "car"]), "classes.json", "2 names, expected at"),
-    "no class": (lambda r: write(r / "classes.json", []), "classes.json", "0 names, expected at least one"),
-    "class number": (lambda r: write(r / "classes.json", {"van": 3}), "classes.json", "got `int` - at `$[...]`"),
-    **{n: (lambda r, c=content: write(r / B, c), B, message) for n, (content, message) in BAD_BOXES.items()},
+    "a bare list": (holding([]), B, "$: got [], expected object"),
+    "unknown key": (holding({"boxes": [{**CAR, "x": 1}]}), B, "$.boxes[0]: Object contains unknown field `x`"),
+    "text": (holding(box_with(w="2")), B, "$.boxes[1].box[4]: got '2', expected float"),
+    "NaN": (holding(box_with(yaw=np.nan)), B, "$.boxes[1].box: yaw: got nan, expected a finite number"),
+    "NaN velocity": (holding(box_with(vx=np.nan, vy=np.nan)), B, "$.boxes[1].box[7]: got nan, expected fl"),
 }
 
 
@@ -240,7 +204,7 @@ def test_damaged_missing_and_surplus_files_are_refused(root, case):
     spoil, file, message = BAD[case]
     spoil(root)
     with refused(message, root / file):
-        read_all(root)
+        FolderFrames(root, reading=ALL).frame(1)
 
 
 @pytest.mark.parametrize(
@@ -250,11 +214,10 @@ def test_damaged_missing_and_surplus_files_are_refused(root, case):
         (1, "{root}/../secret.npy", "$[1].file: resolves to"),
         (1, "../older/9.npy", "$[1].file: no such file"),
         (0, "../older/1.npy", "$[0].file: got '../older/1.npy', expected the frame's own cloud, '../clouds/b.np"),
-        (2, 3, "$[2].file: got 3, expected str"),
     ],
 )
 def test_wrong_files_in_a_list_of_sweeps_are_refused(root, sweeps, index, name, message):
-    sweeps[index]["file"] = name.format(root=root) if isinstance(name, str) else name
+    sweeps[index]["file"] = name.format(root=root)
     write(root / "sweeps" / "b.json", sweeps)
     frames = FolderFrames(root, reading=CloudReading(3, "all"))
     for read in (lambda: frames.frame(1), lambda: frames.check_files([1]), frames.fingerprint):
@@ -262,12 +225,9 @@ def test_wrong_files_in_a_list_of_sweeps_are_refused(root, sweeps, index, name, 
             read()
 
 
-def test_time_offsets_within_a_sweep_are_refused_as_lags(root):
+def test_more_time_lags_than_sweeps_are_refused(root):
     """Otherwise all points but the first would belong to older sweeps, and no box would contain any."""
     points = np.tile(np.load(root / "clouds" / "b.npy"), (40, 1))
-    np.save(root / "clouds" / "b.npy", np.column_stack([points, np.linspace(0, 0.1, 160)]))
-    with refused("fifth column: got 160 different values up to 0.1, expected the time lag", root / "clouds/b.npy"):
-        FolderFrames(root, reading=ALL).frame(1)
     np.save(root / "clouds" / "b.npy", np.column_stack([points, np.repeat([0, 0.05, 0.1, np.nan], 40)]))
     with refused("fifth column: got 3 different values up to 0.1, expected the time lag", root / "clouds/b.npy"):
         FolderFrames(root, reading=CloudReading(2)).frame(1)

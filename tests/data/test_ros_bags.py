@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from made_bags import FORMS, structured, write_recording
+from made_bags import FORMS, Messages, structured, write_recording
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +16,21 @@ START_NS = 1_700_000_000_123_456_789
 POINTS = structured(np.random.default_rng(0).uniform(1, 20, (12, 4)).astype(np.float32))
 NO_TURN = (0, 0, 0, 1)
 VELOCITY, YAW_RATE = np.array([8.0, -3.0, 0.5]), 0.7
+
+
+def one_cloud(make):
+    return [("/p", make.cloud(1, POINTS))]
+
+
+def one_sweep(folder, points, **changed):
+    """Write a message of points, and read it."""
+    bag = write_recording(folder / "a", "sqlite", lambda make: [("/p", make.cloud(1, points, **changed))])
+    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    return sweep
+
+
+def data_file(bag):
+    return bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
 
 
 def layout(itemsize, **fields):
@@ -41,8 +56,7 @@ DRIVERS = {
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
-@pytest.mark.parametrize("form", ["ros1", "mcap"])
-def test_clouds_of_common_drivers_are_read(tmp_path, driver, form):
+def test_clouds_of_common_drivers_are_read(tmp_path, driver):
     rng, dtype = np.random.default_rng(1), DRIVERS[driver]
     points = np.frombuffer(rng.bytes(dtype.itemsize * 20), dtype).copy()  # noise in the gaps and in other fields
     values = rng.integers(1, 60, (20, 4))
@@ -51,7 +65,7 @@ def test_clouds_of_common_drivers_are_read(tmp_path, driver, form):
     for name, column in zip(("x", "y", "z", light), values.T, strict=True):
         points[name] = column
     points[laser] = np.arange(20)
-    bag = write_recording(tmp_path / "a", form, lambda make: [("/points", make.cloud(START_NS, points))])
+    bag = write_recording(tmp_path / "a", "mcap", lambda make: [("/points", make.cloud(START_NS, points))])
     [sweep] = ros_bag_drive(bag, ARGOVERSE2).sweeps
     expected = np.column_stack([values, np.zeros(20), np.arange(20)])
     np.testing.assert_array_equal(sweep.points, expected.astype(np.float32))
@@ -67,23 +81,21 @@ def test_rows_of_organised_clouds_may_be_padded_and_contain_nan(tmp_path):
     rows["z"][1, 2] = np.nan
     padded = np.zeros((2, 6 * 16 + 10), np.uint8)
     padded[:, : 6 * 16] = np.frombuffer(rows.tobytes(), np.uint8).reshape(2, -1)
-    changed = {"row_step": 6 * 16 + 10, "data": padded.ravel()[:-10]}
-    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, rows, **changed))])
-    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    sweep = one_sweep(tmp_path, rows, row_step=6 * 16 + 10, data=padded.ravel()[:-10])
     np.testing.assert_array_equal(sweep.points[:, 2], rows["z"].ravel())
     np.testing.assert_array_equal(sweep.points[:, 0], rows["x"].ravel())
 
 
-@pytest.mark.parametrize("row_step", [0, 6, 6 * 16 - 1, 6 * 16 + 10, 2**32 - 1])
+@pytest.mark.parametrize("row_step", [0, 6, 2**32 - 1])
 def test_a_wrong_row_step_does_not_matter_where_the_length_decides(tmp_path, row_step):
-    rows = np.stack([POINTS[:6], POINTS[6:]])
-    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, rows, row_step=row_step))])
-    [sweep] = ros_bag_drive(bag, TINY).sweeps
-    np.testing.assert_array_equal(sweep.points[:, 2], rows["z"].ravel())
+    sweep = one_sweep(tmp_path, np.stack([POINTS[:6], POINTS[6:]]), row_step=row_step)
+    np.testing.assert_array_equal(sweep.points[:, 2], POINTS["z"])
 
 
-@pytest.mark.parametrize("form", ["sqlite", "mcap"])
-@pytest.mark.parametrize("identifier", ["  storage_identifier: ''\n", '  storage_identifier: ""\n', ""])
+@pytest.mark.parametrize(
+    ("form", "identifier"),
+    [("sqlite", "  storage_identifier: ''\n"), ("mcap", '  storage_identifier: ""\n'), ("mcap", "")],
+)
 def test_reindexed_recordings_without_a_storage_identifier_are_read(tmp_path, form, identifier):
     bag = write_recording(tmp_path / "a", form, one_cloud)
     text = (bag / "metadata.yaml").read_text()
@@ -108,7 +120,7 @@ def test_folders_of_files_are_read_in_the_order_of_recording(tmp_path, form):
                 *(("/p", make.cloud((before + i) * 1000, POINTS)) for i in range(3)),
             ],
         )
-        file = bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
+        file = data_file(bag)
         file.rename(folder / f"{name}{file.suffix}")
     assert is_ros_bag(folder)
     sweeps = list(ros_bag_drive(folder, TINY).sweeps)
@@ -136,14 +148,6 @@ def test_without_odometry_sweeps_have_times_but_no_poses(tmp_path, form):
     assert [sweep.time_us for sweep in sweeps] == [START_NS // 1000 + i * 10**5 for i in range(3)]
 
 
-def one_cloud(make):
-    return [("/p", make.cloud(1, POINTS))]
-
-
-def turn(yaw):
-    return Rotation.from_euler("z", yaw).as_quat()
-
-
 def test_clouds_of_several_sensors_on_one_topic_are_told_once(tmp_path, capsys):
     def clouds(make):
         for number in range(6):
@@ -153,6 +157,10 @@ def test_clouds_of_several_sensors_on_one_topic_are_told_once(tmp_path, capsys):
     assert len(list(ros_bag_drive(bag, TINY).sweeps)) == 6
     told = f"note: {bag}: /points: message 2: frame_id 'rear' after 'lidar': clouds of several sensors?\n"
     assert capsys.readouterr().err == told
+
+
+def turn(yaw):
+    return Rotation.from_euler("z", yaw).as_quat()
 
 
 def matrix(place, quaternion):
@@ -238,11 +246,7 @@ def odometry_beside_two_parents(make):
 SOURCES = {  # source of the poses, their messages, the pose of the LiDAR at a time
     "odometry of the LiDAR": ("/odom", odometry_of("lidar"), body),
     "odometry of the vehicle": ("/odom", odometry_of("/base_link"), lambda s: body(s) @ TO_LIDAR),
-    "odometry of the IMU": (
-        "/odom",
-        odometry_of("imu"),
-        lambda s: body(s) @ IMU_TO_LIDAR,
-    ),
+    "odometry of the IMU": ("/odom", odometry_of("imu"), lambda s: body(s) @ IMU_TO_LIDAR),
     "poses": ("/pose", poses_of("pose_stamped"), body),
     "poses with covariance": ("/pose", poses_of("pose_with_covariance"), body),
     "transforms up to odom, which does not jump": ("tf", transforms_below_map, lambda s: body(s) @ TO_LIDAR),
@@ -251,8 +255,10 @@ SOURCES = {  # source of the poses, their messages, the pose of the LiDAR at a t
 }
 
 
-@pytest.mark.parametrize("case", SOURCES)
-@pytest.mark.parametrize("form", ["ros1", "sqlite"])
+@pytest.mark.parametrize(
+    ("case", "form"),
+    [*((case, "sqlite") for case in SOURCES), ("transforms up to odom, which does not jump", "ros1")],
+)
 def test_poses_are_interpolated_and_combined_with_transforms(tmp_path, form, case):
     source, poses, expected = SOURCES[case]
     bag = write_recording(tmp_path / "a", form, lambda make: drive_content(make, poses))
@@ -263,17 +269,14 @@ def test_poses_are_interpolated_and_combined_with_transforms(tmp_path, form, cas
 
 
 def test_poses_from_a_file_are_of_the_sensor(tmp_path):
-    lines = [
-        " ".join(map(str, [f"{t // 10**9}.{t % 10**9:09d}", *place, *quaternion]))
-        for t, (place, quaternion) in ((t, motion(seconds)) for seconds, t in times_ns())
-    ]
-    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    rows = [(f"{t // 10**9}.{t % 10**9:09d}", *np.concatenate(motion(seconds))) for seconds, t in times_ns()]
+    (tmp_path / "poses.txt").write_text("\n".join(" ".join(map(str, row)) for row in rows))
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, lambda _: ()))
     expect_poses(ros_bag_drive(bag, TINY, poses=tmp_path / "poses.txt"), body)
 
 
 def test_message_definitions_in_the_recording_are_ignored(tmp_path):
-    bag = write_recording(tmp_path / "a", "ros1", lambda make: [("/points", make.cloud(1, POINTS))])
+    bag = write_recording(tmp_path / "a", "ros1", one_cloud)
     content = bag.read_bytes()
     assert content.count(b"uint32 height") > 0
     bag.write_bytes(content.replace(b"uint32 height", b"string heigh!"))
@@ -298,11 +301,10 @@ def test_clouds_outside_the_poses_are_skipped_with_a_note(tmp_path):
         list(ros_bag_drive(bag, TINY, odometry="/odom").sweeps)
 
 
-@pytest.mark.parametrize("name", ["a%20b", "a?mode=rw", "a#b"])
+@pytest.mark.parametrize("name", ["a%20b.db3", "a?mode=rw.db3", "a#b.db3"])
 def test_file_names_that_sqlite_misreads_are_refused(tmp_path, name):
-    with refused(f"{name}.db3: %, ? or # in the name"):
-        (tmp_path / f"{name}.db3").touch()
-        ros_bag_drive(tmp_path / f"{name}.db3", TINY)
+    with refused(f"{name}: %, ? or # in the name"):
+        ros_bag_drive(tmp_path / name, TINY)
 
 
 def moving(*names):
@@ -313,22 +315,18 @@ def moving(*names):
     )
 
 
-def odometry(*rows):
-    return lambda make: (("/odom", make.odometry(START_NS + t, *pose)) for t, *pose in rows)
+def standing(*stamps_ns, **last):
+    """Odometry at the origin; ``last`` are changes of the last message."""
+
+    def content(make):
+        for stamp in stamps_ns:
+            changes = last if stamp == stamps_ns[-1] else {}
+            yield "/odom", make.odometry(START_NS + stamp, (0, 0, 0), **{"turn": NO_TURN, **changes})
+
+    return content
 
 
-def standing(*stamps_ns):
-    """Odometry that stays at the origin."""
-    return odometry(*((stamp, (0, 0, 0), NO_TURN) for stamp in stamps_ns))
-
-
-NOWHERE = odometry()
-CHASSIS = odometry(*((round(s * 1e9), (0, 0, 0), NO_TURN, "chassis") for s in POSES_S))
 WRONG_DRIVES = {  # source of the poses, their messages, fragments of the message
-    "no odometry": (
-        *("/odom", NOWHERE, "odometry: got '/odom', expected a topic of Odometry or PoseStamped or"),
-        "/points (sensor_msgs/msg/P",
-    ),
     "another topic of odometry": (
         *("/odm", standing(0), "odometry: got '/odm', expected"),
         "among: /odom (nav_msgs/msg/Odometry, 1 messages)",
@@ -339,19 +337,22 @@ WRONG_DRIVES = {  # source of the poses, their messages, fragments of the messag
         "1700000000.123461 s, expected a later one",
     ),
     "no unit quaternion": (
-        *("/odom", odometry((0, (0, 0, 0), NO_TURN), (4000, (0, 0, 0), (0, 0, 0, 0)))),
+        *("/odom", standing(0, 4000, turn=(0, 0, 0, 0))),
         "/odom: message 1: rotation: got [0.0, 0.0, 0.0, 0.0], expected a unit quaternion",
     ),
-    "far away": ("/odom", odometry((0, (0, np.nan, 0), NO_TURN)), "/odom: message 0: translation: got"),
     "other frames": (
-        *("/odom", odometry((0, (0, 0, 0), NO_TURN), (4000, (0, 0, 0), NO_TURN, "imu"))),
+        *("/odom", standing(0, 4000, child="imu")),
         "/odom: message 1: child_frame_id: got 'imu', expected 'base_link' as before",
     ),
     "no transform": (
-        *("/odom", CHASSIS, "/points: message 0: no transform from 'lidar' to 'chassis', expected one in"),
+        *("/odom", odometry_of("chassis"), "/points: message 0: no transform from 'lidar' to 'chassis', expected"),
         "transforms of: imu, lidar, mount",
     ),
-    "nothing that moves": ("tf", NOWHERE, "got the frames lidar -> mount -> base_link, expected one that moves"),
+    "nothing that moves": (
+        "tf",
+        standing(),
+        "got the frames lidar -> mount -> base_link, expected one that moves",
+    ),
     "a gap in transforms": (
         *("tf", lambda make: np.delete(list(moving(("odom", "base_link"))(make)), range(2, 8), axis=0)),
         "/points: message 1: tf of base_link in odom: at 1700000000.323456 s: a gap in the poses",
@@ -391,6 +392,12 @@ def test_topics_must_be_named_if_there_are_several(tmp_path):
         ros_bag_drive(tmp_path / "a", TINY, topic="/rear", odometry="tf")
 
 
+def field(offset, datatype, count):
+    """Fields of which x is changed."""
+    fields = ("x", offset, datatype, count), ("y", 4, 7, 1), ("z", 8, 7, 1)
+    return {"fields": [Messages(is_ros1=False).make("sensor_msgs/PointField", *each) for each in fields]}
+
+
 WRONG_CLOUDS = {
     "too short": (
         {"data": np.zeros(191, np.uint8)},
@@ -399,38 +406,26 @@ WRONG_CLOUDS = {
     "huge": ({"width": 2**32 - 1, "height": 2**32 - 1}, "x 4294967295 points, expected at most 10000000"),
     "wide rows": ({"row_step": 2**32 - 1, "height": 2}, "data: got 192 bytes, and row_step 4294967295"),
     "narrow rows": ({"row_step": 100, "width": 7, "height": 2}, "data: got 192 bytes, and row_step 100"),
-    "no step": ({"point_step": 0}, "field x: got 1 of datatype 7 at offset 0, expected"),
     "narrow step": ({"point_step": 10}, "field z: got 1 of datatype 7 at offset 8, expected"),
     "no fields": ({"fields": []}, "fields: got none, expected one named x"),
-    "no datatype": (("x", 0, 9, 1), "field x: got 1 of datatype 9 at offset 0, expected one number"),
-    "several numbers": (("x", 0, 7, 3), "field x: got 3 of datatype 7"),
-    "far field": (("x", 2**32 - 1, 7, 1), "field x: got 1 of datatype 7 at offset 4294967295"),
+    "no datatype": (field(0, 9, 1), "field x: got 1 of datatype 9 at offset 0, expected one number"),
+    "several numbers": (field(0, 7, 3), "field x: got 3 of datatype 7"),
+    "far field": (field(2**32 - 1, 7, 1), "field x: got 1 of datatype 7 at offset 4294967295"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG_CLOUDS)
 def test_damaged_clouds_are_refused(tmp_path, case):
     changed, message = WRONG_CLOUDS[case]
-
-    def content(make):
-        if isinstance(changed, dict):
-            return [("/p", make.cloud(1, POINTS, **changed))]
-        cloud = make.cloud(1, POINTS)
-        cloud.fields[0] = make.make("sensor_msgs/PointField", *changed)
-        return [("/p", cloud)]
-
-    bag = write_recording(tmp_path / "a", "sqlite", content)
-    with refused(f"{bag}: /p: message 0: ", message):
-        list(ros_bag_drive(bag, TINY).sweeps)
+    with refused(f"{tmp_path / 'a'}: /p: message 0: ", message):
+        one_sweep(tmp_path, POINTS, **changed)
 
 
 @pytest.mark.parametrize(
     "changed", [{}, {"fields": [], "point_step": 0, "row_step": 0}, {"height": 0, "width": 9}]
 )
 def test_messages_without_points_are_empty_sweeps(tmp_path, changed):
-    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS[:0], **changed))])
-    [sweep] = ros_bag_drive(bag, NUSCENES_HDL32E).sweeps
-    assert sweep.points.shape == (0, 5)
+    assert one_sweep(tmp_path, POINTS[:0], **changed).points.shape == (0, 5)
 
 
 def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):
@@ -442,8 +437,7 @@ def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("form", "how"),
-    [("ros1", "LZ4"), ("ros1", "BZ2"), ("sqlite", "FILE"), ("sqlite", "MESSAGE"), ("mcap file", "STORAGE")],
+    ("form", "how"), [("ros1", "LZ4"), ("sqlite", "FILE"), ("sqlite", "MESSAGE"), ("mcap file", "STORAGE")]
 )
 def test_compressed_recordings_are_read(tmp_path, form, how):
     bag = write_recording(tmp_path / "a", form, one_cloud, compression=how)
@@ -451,21 +445,20 @@ def test_compressed_recordings_are_read(tmp_path, form, how):
     np.testing.assert_array_equal(sweep.points[:, 2], POINTS["z"])
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("share", [0, 0.3, 0.97])
+@pytest.mark.parametrize(
+    ("form", "share"), [("sqlite", 0), ("sqlite", 0.97), ("ros1", 0.97), ("mcap", 0.97), ("mcap file", 0.3)]
+)
 def test_truncated_recordings_are_refused(tmp_path, form, share):
-    clouds = [structured(np.random.default_rng(i).normal(0, 5, (5000, 4)).astype(np.float32)) for i in range(3)]
-    bag = write_recording(
-        tmp_path / "a", form, lambda make: [("/p", make.cloud(i, cloud)) for i, cloud in enumerate(clouds)]
-    )
-    file = bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
+    cloud = structured(np.random.default_rng(0).normal(0, 5, (5000, 4)).astype(np.float32))
+    bag = write_recording(tmp_path / "a", form, lambda make: [("/p", make.cloud(i, cloud)) for i in range(3)])
+    file = data_file(bag)
     content = file.read_bytes()
     file.write_bytes(content[: round(share * len(content))])
     with refused(f"{bag}: ", "cannot be read: "):
         list(ros_bag_drive(bag, TINY).sweeps)
 
 
-@pytest.mark.parametrize("text", ["", "{", "rosbag2_bagfile_information: 3", "a: &a [*a]", "\0"])
+@pytest.mark.parametrize("text", ["", "{", "a: &a [*a]"])
 def test_damaged_metadata_are_refused(tmp_path, text):
     bag = write_recording(tmp_path / "a", "sqlite", one_cloud)
     (bag / "metadata.yaml").write_text(text)

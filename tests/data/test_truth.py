@@ -18,12 +18,7 @@ from experiments.cached import CachedFrames
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.clouds import CloudFiles
-from fcos_lidar_jax.data.frame import (
-    Frame,
-    FrameSet,
-    InMemoryFrames,
-    SelectedFrames,
-)
+from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, SelectedFrames
 from fcos_lidar_jax.input_pipeline.open import Format, open_frames
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames

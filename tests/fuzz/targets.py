@@ -7,22 +7,18 @@ import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from random import Random
 
-import jax
 import numpy as np
-from jax import export
 from made_argoverse2 import START_NS, STEP_NS, write_boxes, write_poses, write_sweep
 from made_bags import Messages, structured, write_recording
 from made_kitti import calibration_text, label_text
 from made_nuscenes import VERSION, make_tables
 from made_nuscenes import write as write_nuscenes
-from toy_frames import ToyFrames
 
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import read_class_map
-from fcos_lidar_jax.config import CloudReading, config_from_json, config_to_json
+from fcos_lidar_jax.config import CloudReading, config_to_json
 from fcos_lidar_jax.data import argoverse2
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.box_geometry import check_boxes
@@ -32,7 +28,6 @@ from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.ros_bags import ros_bag_drive
 from fcos_lidar_jax.data.sweeps import read_sweeps
@@ -43,8 +38,6 @@ from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix
-from fcos_lidar_jax.inference.export import load_exported
-from fcos_lidar_jax.input_pipeline.database import open_database, prepare_database
 from fcos_lidar_jax.input_pipeline.open import READERS
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import (
@@ -57,25 +50,17 @@ from fcos_lidar_jax.sensors import (
     sensor_from_json,
     sensor_to_json,
 )
-from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
-from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.training.metrics_log import read_metrics
-from fcos_lidar_jax.training.plan import check_run
-
-from .mutators import mutate, mutate_bytes, mutate_json
 
 CONFIG = dataclasses.replace(QUICKSTART, max_points=64)
 _RNG = np.random.default_rng(0)
 POINTS = np.column_stack([_RNG.uniform(-20, 20, (60, 2)), _RNG.uniform(-2, 1, 60), _RNG.uniform(0, 90, 60)])
 POSE = np.eye(4).tolist()
-SPEC = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=False, version="v")
 
 NAMES = (
     *("raw points", "raw points of KITTI", "npy", "npz", "pcd", "feather", "Argoverse 2", "KITTI"),
-    *("folder", "nuScenes", "nuScenes index", "list of sweeps", "sensor", "poses"),
-    *("recordings of ROS", "class map", "results", "ground truth", "detections", "run.json"),
-    *("metrics.jsonl", "resume log", "checkpoint.json", "exported detector", "ground-truth database"),
-    "records of synthesize",
+    *("folder", "nuScenes", "list of sweeps", "sensor", "poses", "recordings of ROS", "class map"),
+    *("results", "ground truth", "detections", "metrics.jsonl", "resume log", "checkpoint.json"),
 )
 """Of all targets, in the order of :func:`make_targets`."""
 
@@ -96,8 +81,6 @@ class Target:
     files: Files  # path below the folder -> content
     read: Read
     changed: tuple[str, ...] = ()  # files to mutate; () for all
-    mutate: Callable[[str, bytes, Random], bytes] = mutate
-    seal: Callable[[Path, str], None] | None = None  # corrects checksums, for half of the inputs
     alone: bool = False  # messages must name the file, not only the folder
 
     @property
@@ -275,27 +258,6 @@ def _read_nuscenes(folder: Path, name: str) -> None:
     check_columns(truth.boxes)
 
 
-def _index_files(folder: Path) -> None:
-    tables, clouds = make_tables(1)
-    write_nuscenes(folder, tables, clouds)
-    save_index(NuScenes(folder, VERSION).index, folder / "index", tables=folder / VERSION)
-
-
-def _read_index(folder: Path, name: str) -> None:
-    column = name.removeprefix("index/").removesuffix(".npy")
-    index = open_index(folder / "index", tables=folder / VERSION)
-    if name.endswith(".npy"):
-        expect(checksum(getattr(index, column).tobytes()) == _column_checksums()[column], "another column")
-
-
-@functools.cache
-def _column_checksums() -> dict[str, str]:
-    with tempfile.TemporaryDirectory() as folder:
-        _index_files(Path(folder))
-        index = open_index(Path(folder, "index"), tables=Path(folder, VERSION))
-    return {name: checksum(column.tobytes()) for name, column in vars(index).items()}
-
-
 def _box(**more: object) -> dict[str, object]:
     plain = {"translation": [1.0, 2, 3], "size": [2.0, 4, 1.5], "rotation": [1.0, 0, 0, 0], "velocity": [0.5, 0]}
     return {**plain, "detection_name": "car", "attribute_name": "vehicle.moving", **more}
@@ -332,15 +294,6 @@ def _read_class_map(folder: Path, name: str) -> None:
     expect(isinstance(found, dict) and all(v is None or isinstance(v, str) for v in found.values()), "no map")
 
 
-RUN_SPEC = {"config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY), "steps": 4, "tests": None}
-RUN_SPEC = json.loads(json.dumps(RUN_SPEC))  # as a run records it, without tuples
-
-
-def _read_run(folder: Path, name: str) -> None:
-    check_run(folder, RUN_SPEC, resume=True)
-    expect(json.loads((folder / name).read_bytes()) == RUN_SPEC, "another run")
-
-
 def _read_metrics(folder: Path, name: str) -> None:
     for line in read_metrics(folder):
         expect(isinstance(line, dict) and isinstance(line.get("step"), int), "a line without a step")
@@ -361,76 +314,10 @@ def _resume_log(folder: Path) -> None:
             log.add(token, [_box()])
 
 
-def _read_description(folder: Path, name: str) -> None:
-    description = read_description(folder)
-    for part, from_json in (("config", config_from_json), ("sensor", sensor_from_json)):
-        from_json(description[part], f"{folder / name}: {part}")
-
-
-def _exported() -> bytes:
-    """A file of `fcos-lidar export`, with a small program."""
-    add = export.export(jax.jit(lambda x: x + 1), platforms=("cpu",))
-    program = bytes(add(jax.ShapeDtypeStruct((3,), np.float32)).serialize())
-    record = {
-        "written_by": "fcos_lidar_jax",
-        "name": CONFIG.name,
-        "classes": list(CONFIG.classes),
-        "batch": 1,
-        "num_points": CONFIG.max_points,
-        "weights": {"parameters": 3, "blake2b": "0"},
-        "sensor": sensor_to_json(TINY),
-        "config": config_to_json(CONFIG),
-    }
-    content = _json(record) + b"\n" + program
-    return b"fcos-lidar-detector 1 " + checksum(content).encode() + b"\n" + content
-
-
-def _mutate_exported(name: str, content: bytes, rng: Random) -> bytes:
-    """Change the line of JSON, or any bytes."""
-    first, line, program = content.split(b"\n", 2)
-    if rng.random() < 0.5:
-        return mutate_bytes(content, rng)
-    return b"\n".join((first, mutate_json(line, rng), program))
-
-
-def _seal_exported(folder: Path, name: str) -> None:
-    first, newline, content = (folder / name).read_bytes().partition(b"\n")
-    (folder / name).write_bytes(first[:22] + checksum(content).encode() + newline + content)
-
-
-def _read_exported(folder: Path, name: str) -> None:
-    detector = load_exported(folder / name)
-    expect(detector.record["batch"] == "any" or detector.record["batch"] >= 1, "no batch")
-    expect(isinstance(detector.fingerprint, str) and detector.config.classes, "no detector")
-
-
-def _description() -> dict[str, object]:
+def _description() -> bytes:
     description = {"format": 3, "step": 4, "files": {"a": "0"}, "data": "", "score": None}
-    return {**description, "config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY)}
-
-
-def _seal_description(folder: Path, name: str) -> None:
-    description = json.loads((folder / name).read_bytes())
-    if isinstance(description, dict):
-        description.pop("hash", None)
-        description["hash"] = checksum(json.dumps(description, sort_keys=True).encode())
-        (folder / name).write_text(json.dumps(description))
-
-
-FRAMES = ToyFrames(1)
-
-
-def _read_database(folder: Path, name: str) -> None:
-    database = open_database(folder)
-    for i in range(min(len(database), 9)):
-        points = database.points(i)
-        expect(points.shape == (database.table["count"][i], database.manifest.columns), "points of another shape")
-    labels = database.table["label"]
-    expect(((labels >= 0) & (labels < len(database.manifest.classes))).all(), "a label that is no class")
-
-
-def _synthesize(folder: Path, name: str = "") -> None:
-    write_dataset(SPEC, folder, workers=1, report=lambda done: None)
+    description |= {"config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY)}
+    return _json(description | {"hash": checksum(json.dumps(description, sort_keys=True).encode())})
 
 
 def plain_name(name: str) -> str:
@@ -460,8 +347,6 @@ def make_targets() -> list[Target]:
     sweep = _files(lambda folder: write_sweep(folder, 0, np.column_stack([POINTS, np.arange(60) % 64])))
     drive = _files(_argoverse2_files)
     tables = _files(lambda folder: write_nuscenes(folder, *make_tables(1)))
-    index = _files(_index_files)
-    synthesized = _files(_synthesize)
     listed = [{"file": "a.npy", "timestamp_us": t, "sensor_to_world": POSE} for t in (9000, 5000)]
     found = {"a": [], "b": [{**_box(), "sample_token": "b", "detection_score": 0.5}] * 2}
     truth = {t: {"ego_translation": [0.0, 0, 0], "boxes": [_box(num_pts=3)] * 2} for t in "ab"}
@@ -475,8 +360,6 @@ def make_targets() -> list[Target]:
         "num_columns": 9,
         "inclinations_deg": {"lowest": -9, "highest": 3, "rows": 4},
     }
-    records = tuple(name for name in synthesized if name.startswith(".synthesize/"))
-    is_column = [name for name in index if name.startswith("index/")]
     file_target = functools.partial(Target, alone=True)
     return [
         file_target("raw points", raw, _cloud(NUSCENES_HDL32E, **layouts)),
@@ -489,7 +372,6 @@ def make_targets() -> list[Target]:
         Target("KITTI", _kitti_files(), lambda folder, _: check_first(KittiFrames(folder, "train"))),
         Target("folder", _folder_files(), _read_folder),
         Target("nuScenes", tables, _read_nuscenes),
-        Target("nuScenes index", index, _read_index, tuple(is_column)),
         Target("list of sweeps", {"a.json": _json(listed), "a.npy": arrays["a.npy"]}, _read_sweeps, ("a.json",)),
         file_target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor),
         file_target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),
@@ -504,24 +386,11 @@ def make_targets() -> list[Target]:
         file_target(
             "detections", {"a.json": _json({"classes": ["car", "sign"], "frames": frames})}, _read_detections
         ),
-        file_target("run.json", {"run.json": _json(RUN_SPEC)}, _read_run),
         file_target(
             "metrics.jsonl", {"metrics.jsonl": b"".join(_json(line) + b"\n" for line in lines)}, _read_metrics
         ),
         file_target("resume log", _files(_resume_log), _read_resume_log),
         Target(
-            "checkpoint.json",
-            {"checkpoint.json": _json(_description())},
-            _read_description,
-            seal=_seal_description,
+            "checkpoint.json", {"checkpoint.json": _description()}, lambda folder, name: read_description(folder)
         ),
-        file_target(
-            "exported detector",
-            {"a.fcos": _exported()},
-            _read_exported,
-            mutate=_mutate_exported,
-            seal=_seal_exported,
-        ),
-        Target("ground-truth database", _files(lambda folder: prepare_database(FRAMES, folder)), _read_database),
-        Target("records of synthesize", synthesized, _synthesize, records),
     ]

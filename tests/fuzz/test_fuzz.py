@@ -1,7 +1,7 @@
 """Every reader refuses a changed file by a ``ValueError`` of one line that names it, or returns valid data.
 
-Valid files of every kind are changed according to their structure. ``FUZZ_EXAMPLES=30000 python -m pytest
-tests/fuzz`` tries that many inputs of each kind.
+Valid files of every kind that is not trusted, and logs that a crash may cut, are changed according to their
+structure. ``FUZZ_EXAMPLES=30000 python -m pytest tests/fuzz`` tries that many inputs of each kind.
 """
 
 import os
@@ -14,11 +14,10 @@ from random import Random
 from typing import get_args
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
 
 from fcos_lidar_jax.input_pipeline.open import Format
 
+from .mutators import mutate
 from .targets import NAMES, InvalidError, Target, make_targets, plain_name
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
@@ -58,14 +57,8 @@ def is_accepted(target: Target, folder: Path, seed: int) -> bool:
     """Whether the reader accepts a changed file; a refusal must be one short line that names the file."""
     rng = Random(f"{target.name} {seed}")
     name = rng.choice(target.mutable)
-    content = target.mutate(name, target.files[name], rng)
     write_files(target, folder)
-    (folder / name).write_bytes(content)
-    if target.seal is not None and rng.random() < 0.5:
-        try:
-            target.seal(folder, name)
-        except (ValueError, RecursionError):  # no longer JSON
-            (folder / name).write_bytes(content)
+    (folder / name).write_bytes(mutate(name, target.files[name], rng))
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
         target.read(folder, name)
@@ -82,26 +75,17 @@ def is_accepted(target: Target, folder: Path, seed: int) -> bool:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_changed_file_is_refused_in_one_line_or_gives_valid_data(name, targets, tmp_path, limits):
-    target, accepted = targets[name], set()
-
-    @settings(
-        max_examples=EXAMPLES,
-        deadline=None,
-        database=None,
-        derandomize=True,
-        phases=[Phase.generate],  # a seed does not shrink to a simpler change
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(st.integers(0, 2**32))
-    def attempt(seed):
-        accepted.add(is_accepted(target, tmp_path, seed))
-
-    attempt()
+    accepted = set()
+    for seed in range(EXAMPLES):
+        try:
+            accepted.add(is_accepted(targets[name], tmp_path, seed))
+        except BaseException as error:
+            error.add_note(f"target {name!r}, seed {seed}")
+            raise
     if name in ("metrics.jsonl", "resume log"):
         assert accepted == {True}  # they skip damaged lines
     else:
         assert False in accepted
-        assert True in accepted or name == "run.json"  # a run spec that differs in anything is of another run
 
 
 def test_every_format_is_tried(targets):
@@ -113,6 +97,4 @@ def test_the_targets_accept_their_own_files(targets, tmp_path):
     for target in targets.values():
         write_files(target, folder := tmp_path / re.sub(r"\W", "_", target.name))
         for name in target.mutable:
-            if target.seal is not None:
-                target.seal(folder, name)
             target.read(folder, name)

@@ -272,7 +272,7 @@ BAD = {
         "class map: got 'nuscenes', expected one of the class maps of format folder: (none)",
     ),
     "map of other data": ({"root": "kitti", "class_map": "kitti"}, "class maps of format kitti: nuscenes"),
-    "other reader": ({"root": "kitti", "format": "folder"}, "no such folder, expected one with .pcd.bin"),
+    "other reader": ({"root": "kitti", "format": "folder"}, "found no file, expected a folder of .pcd.bin"),
 }
 
 
