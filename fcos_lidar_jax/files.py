@@ -118,12 +118,15 @@ def check_writable(path: Path) -> None:
 def _check_kind(path: Path) -> None:
     """Reject URLs, and what a file must not replace: folders, devices, and links, whose targets would remain."""
     local_path(path)
+    found = None
     if path.is_symlink():
-        raise FileExistsError(f"{path}: found a link to {path.readlink()}, expected a file to write")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: found a folder, expected a file to write")
-    if path.exists() and not path.is_file():
-        raise FileExistsError(f"{path}: found a device or a pipe, expected a file to write")
+        found = f"a link to {path.readlink()}"
+    elif path.is_dir():
+        found = "a folder"
+    elif path.exists() and not path.is_file():
+        found = "a device or a pipe"
+    if found:
+        raise FileExistsError(f"{path}: found {found}, expected a file to write")
 
 
 @contextlib.contextmanager
@@ -203,9 +206,7 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
         raise ValueError(f"{path}: not JSON: {error}") from None
     try:
         return msgspec.convert(content, kind)
-    except (OverflowError, UnicodeError) as error:  # an integer beyond float range, a lone surrogate
-        raise ValueError(f"{path}: {error}") from None
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, OverflowError, UnicodeError) as error:  # huge integers, lone surrogates
         raise ValueError(f"{path}: {_explain(str(error), content)}") from None
 
 

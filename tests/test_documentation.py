@@ -26,8 +26,10 @@ from fcos_lidar_jax.evaluation.kitti_results import kitti_types
 from fcos_lidar_jax.input_pipeline.open import READERS
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.sensors import SHORT_RANGE, Sensor
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
 from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.types import Batch
 
@@ -151,7 +153,8 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
     if page.name == "stream.md":
         make_drive(tmp_path)
     if page.name == "README.md":
-        demo._simulate(demo.Demo(keyframes=1), fcos_lidar_jax.load_detector(demo.WEIGHTS))
+        (folder := demo.Demo().out / "drive" / "samples" / CHANNEL).mkdir(parents=True)
+        make_frame(0, NUSCENES_HDL32E).points.tofile(folder / "a.pcd.bin")
     namespace: dict = {}
     for block in blocks(page, "python"):
         exec(compile(block, page.name, "exec"), namespace)

@@ -30,23 +30,28 @@ def test_atomic_write_replaces_the_whole_file(tmp_path):
     assert file.stat().st_mode & 0o777 == 0o666 & ~mask, "default permissions"
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_failed_write_keeps_the_old_file(tmp_path, error):
+def test_an_interrupted_write_keeps_the_old_file(tmp_path):
     file = tmp_path / "a.json"
     file.write_text("old")
 
     def write(temporary):
         temporary.write_text("half")
-        raise error
+        raise KeyboardInterrupt
 
-    with pytest.raises(error):
+    with pytest.raises(KeyboardInterrupt):
         atomic_write(file, write)
     assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [("a.json", "old")]
 
 
-def test_a_folder_is_not_replaced(tmp_path):
-    with pytest.raises(IsADirectoryError, match="found a folder, expected a file to write"):
-        atomic_write(tmp_path, lambda temporary: temporary.write_text(""))
+def test_only_files_are_replaced(tmp_path):
+    (tmp_path / "link").symlink_to("a.json")
+    for path, found in (
+        (tmp_path, "a folder"),
+        (tmp_path / "link", "a link to a.json"),
+        ("/dev/null", "a device"),
+    ):
+        with pytest.raises(FileExistsError, match=f"{path}: found {found}.*, expected a file to write"):
+            atomic_write(path, lambda temporary: temporary.write_text(""))
 
 
 _HOLDER = """
@@ -117,18 +122,15 @@ from pathlib import Path
 from fcos_lidar_jax.files import line_writer
 resource.setrlimit(resource.RLIMIT_FSIZE, (1500, 1500))  # writes beyond 1,500 bytes fail, as on a full disk
 with line_writer(Path(sys.argv[1])) as write_line:
-    for _ in range(int(sys.argv[2])):
+    for _ in range(2):
         write_line(1000 * b"x")
 """
 
 
-@pytest.mark.parametrize("lines", [2, 3])
-def test_a_full_disk_leaves_whole_lines_and_is_reported(tmp_path, lines):
+def test_a_full_disk_leaves_whole_lines_and_is_reported(tmp_path):
     """Only a part of the second line fits."""
     file = tmp_path / "a.jsonl"
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, file, str(lines)], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", FULL, file], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert f"{file}: cannot be written: File too large" in done.stderr
     assert file.read_bytes() == 1000 * b"x" + b"\n"
@@ -143,13 +145,3 @@ def test_a_second_line_writer_of_a_file_is_rejected(tmp_path):
             pass
         write_line(b"2")
     assert [json.loads(line) for line in file.read_text().splitlines()] == [1, 2]
-
-
-def test_a_failed_line_is_removed(tmp_path):
-    file = tmp_path / "a.jsonl"
-    with line_writer(file) as write_line:
-        write_line(b"1")
-        with pytest.raises(TypeError):
-            write_line("text")  # type: ignore[arg-type]
-        write_line(b"2")
-    assert file.read_bytes() == b"1\n2\n"

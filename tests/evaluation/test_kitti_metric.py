@@ -75,25 +75,18 @@ def random_frame(rng, *, plain=False):
     return "".join(truths), "".join(found)
 
 
-def deviation_from_oracle(tmp_path, seed):
+@pytest.mark.parametrize("seed", range(6))
+def test_equals_the_plain_loops(tmp_path, seed):
     rng, plain = np.random.default_rng(seed), bool(seed % 2)
     texts = [random_frame(rng, plain=plain) for _ in range(rng.integers(20, 50) if plain else rng.integers(1, 20))]
-    summary, largest = evaluate_texts(tmp_path, texts), 0.0
+    summary = evaluate_texts(tmp_path, texts)
     assert summary["num_frames"] == len(texts)
     expected = score(texts)
     assert {metric for _, metric, _ in expected} == {*KINDS}
     for (name, metric, difficulty), (number, percent) in expected.items():
         ours = summary["classes"][name.capitalize()]
         assert ours["num_truth"][difficulty] == number
-        value = ours[metric][difficulty]
-        assert (value is None) == (number == 0)
-        largest = max(largest, abs((value or 0.0) - percent))
-    return largest
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_equals_the_plain_loops(tmp_path, seed):
-    assert deviation_from_oracle(tmp_path, seed) < 1e-6
+        assert ours[metric][difficulty] == (pytest.approx(percent, abs=1e-6) if number else None)
 
 
 def test_overlaps_equal_shapelys():
@@ -115,18 +108,20 @@ def street(kind="Car", number=NUMBER, **options):
     return [line(kind, 6.0 * i, **options) for i in range(number)]
 
 
-def ap(tmp_path, truths, found, name="Car", metric="3d"):
-    return evaluate_texts(tmp_path, [("".join(truths), "".join(found))])["classes"][name][metric]
+def ap(tmp_path, truths, found, name="Car", metrics=("3d",)):
+    """Average precisions by difficulty, which must be the same for all ``metrics``."""
+    scores = evaluate_texts(tmp_path, [("".join(truths), "".join(found))])["classes"][name]
+    assert all(scores[metric] == scores[metrics[0]] for metric in metrics)
+    return scores[metrics[0]]
 
 
 def all_of(value):
     return pytest.approx(dict.fromkeys(("easy", "moderate", "hard"), value))
 
 
-@pytest.mark.parametrize("metric", KINDS)
 @pytest.mark.parametrize("name", MIN_OVERLAP)
-def test_perfect_one_missing_and_one_too_many(tmp_path, name, metric):
-    truths, found, where = street(name), street(name, score=0.8), (name, metric)
+def test_perfect_one_missing_and_one_too_many(tmp_path, name):
+    truths, found, where = street(name), street(name, score=0.8), (name, KINDS)
     assert ap(tmp_path, truths, found, *where) == all_of(100)
     # Recall 49 / 50 reaches the positions up to 39 / 40, the first of which is not averaged.
     assert ap(tmp_path, truths, found[1:], *where) == all_of(97.5)
@@ -136,17 +131,11 @@ def test_perfect_one_missing_and_one_too_many(tmp_path, name, metric):
     assert ap(tmp_path, [], found, *where) == dict.fromkeys(("easy", "moderate", "hard"))
 
 
-def test_few_objects_stay_below_100_as_in_the_development_kit(tmp_path):
-    few = [("".join(street(number=21)), "".join(street(number=21, score=0.8)))]
-    summary = evaluate_texts(tmp_path, few, classes=["Car"])
-    assert summary["classes"]["Car"]["bev"] == all_of(50)
-    assert "few objects of Car" in describe_kitti(summary)
-
-
 def test_the_table_counts_the_objects_of_each_difficulty(tmp_path):
     cars = [line("Car", 0.0), *(line("Car", 6.0 * i, high=30) for i in range(1, 4)), line("Van", 30.0)]
     summary = evaluate_texts(tmp_path, [("".join(cars), "")], classes=["Car", "Cyclist"])
-    head, bev, *_, cyclist = describe_kitti(summary).splitlines()[:9]
+    head, bev, *_, cyclist, few = describe_kitti(summary).splitlines()
+    assert few.startswith("few objects of Car: ")
     assert head.endswith("     hard objects: easy / moderate / hard")
     assert " ".join(bev.split()) == "Car 0.7 bev 0.00 0.00 0.00 1 / 4 / 4"
     assert " ".join(cyclist.split()) == "Cyclist 0.5 aos - - - 0 / 0 / 0"
@@ -157,19 +146,16 @@ def test_the_table_counts_the_objects_of_each_difficulty(tmp_path):
 
 def test_an_overlap_must_exceed_the_least_and_space_counts_the_height(tmp_path):
     """A pedestrian shifted by a third of its extent overlaps by exactly a half."""
-    truths = [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in street("Pedestrian")]
+
+    def people(x=0.0, y=1.7, **options):
+        rows = [line("Pedestrian", 6.0 * i + x, y=y, **options) for i in range(NUMBER)]
+        return [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in rows]
+
+    truths, above = people(), ("Pedestrian", ["bev"])
     for shift, bev in ((0.5, 0), (0.499, 100)):
-        found = [line("Pedestrian", 6.0 * i + shift, score=0.8) for i in range(NUMBER)]
-        found = [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in found]
-        assert ap(tmp_path, truths, found, "Pedestrian", "bev") == all_of(bev)
+        assert ap(tmp_path, truths, people(shift, score=0.8), *above) == all_of(bev)
     for lift, space in ((0.499, 100), (0.501, 0)):
-        found = [
-            row.replace(" 1.7 20.0", f" {1.7 - lift} 20.0")
-            for row in (line("Pedestrian", 6.0 * i, score=0.8) for i in range(NUMBER))
-        ]
-        found = [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in found]
-        assert ap(tmp_path, truths, found, "Pedestrian") == all_of(space)
-        assert ap(tmp_path, truths, found, "Pedestrian", "bev") == all_of(100)
+        assert ap(tmp_path, truths, people(y=1.7 - lift, score=0.8), "Pedestrian") == all_of(space)
 
 
 PEDESTRIANS = street("Pedestrian", score=0.8)
@@ -196,15 +182,6 @@ def test_image_boxes_and_orientation(tmp_path, case):
     assert [*map(scores.get, ("image", "aos"))] == [None if each is None else all_of(each) for each in percents]
     if len(found) > NUMBER:  # regions excuse in the image only
         assert scores["bev"] == scores["3d"] == all_of(100 * 50 / 51)
-
-
-def test_the_score_decides_first_and_the_overlap_then(tmp_path):
-    """Two detections of an object: the thresholds are the better score's, the true positive is the nearer one."""
-    found = [row for i in range(NUMBER) for row in (line(x=6.0 * i + 0.3, score=0.9), line(x=6.0 * i, score=0.5))]
-    assert ap(tmp_path, street(), found) == all_of(100)  # at 0.9 there are no others
-    pair = [line(), line(x=0.3)]
-    crossed = [line(x=0.3, score=0.9), line(score=0.9)]  # the nearer one each, in whatever order
-    assert ap(tmp_path, [*pair, *street()[1:]], [*crossed, *street(score=0.8)[1:]]) == all_of(100)
 
 
 def test_the_last_true_positive_is_a_threshold_anyhow(tmp_path):
@@ -250,8 +227,6 @@ def test_results_are_read_as_by_the_development_kit(tmp_path, case):
         file.write_text(text)
     summary = evaluate_kitti(tmp_path / "results", tmp_path / "labels")
     assert summary["classes"]["Car"]["3d"]["moderate"] == pytest.approx(percent)
-    expected = score([(label, result)])
-    assert expected["car", "3d", "moderate"][1] == pytest.approx(percent)
     lines = [text for text in describe_kitti(summary).splitlines()[1:] if not text.startswith((*MIN_OVERLAP,))]
     assert [text.startswith(told) for text in lines] == [True] * bool(told)
 
@@ -273,14 +248,11 @@ def test_boxes_in_the_image_only_and_in_3d_only_have_their_own_rows(tmp_path):
 
 def test_bad_results_get_one_line(tmp_path):
     labels = tmp_path / "labels"
-    with refused("classes: got 'Vans', expected"):
-        evaluate_kitti(tmp_path, labels, classes=["Vans"])
     with refused(f"{tmp_path / 'none'}: no .txt file in it, expected one for every frame"):
         evaluate_kitti(tmp_path / "none", labels)
     for result, message in (
         (line(score=0.5) + line(), "000000.txt: line 2: got 15 values, expected 16, the score last"),
         (FLAT.replace("100 100 150 150", "-1 -1 -1 -1"), "results: got boxes neither in the image nor in 3D"),
-        (line(score=0.5).replace("0.5", "nan"), "line 1: score: got 'nan', expected a finite number"),
     ):
         with refused(message):
             evaluate_texts(tmp_path, [(line(), result)])

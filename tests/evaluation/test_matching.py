@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.matching import Pairs, candidate_pairs, greedy, heading_error, match_frame
+from fcos_lidar_jax.evaluation.matching import candidate_pairs, heading_error, match_frame
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
 
 CAR, CONE, BARRIER = (NUSCENES_METRIC.classes.index(c) for c in ("car", "traffic_cone", "barrier"))
@@ -53,8 +53,3 @@ def test_pairs_match_a_double_loop(monkeypatch):
         expected += [(d, t, distance) for distance, t in sorted(near) if distance < 3]
     assert list(zip(pairs.detection.tolist(), pairs.truth.tolist(), strict=True)) == [e[:2] for e in expected]
     np.testing.assert_allclose(pairs.distance_m, [e[2] for e in expected])
-
-
-def test_a_detection_without_a_free_truth_stays_unmatched():
-    pairs = Pairs(np.array([0, 1, 2, 2]), np.array([0, 0, 0, 2]), np.array([0.1, 0.1, 0.1, 0.2]))
-    assert greedy(pairs, 4, 3).tolist() == [0, -1, 2, -1]

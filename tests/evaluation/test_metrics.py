@@ -87,7 +87,7 @@ def test_single_class_values(truth, found, expected):
     assert average_precision(class_curves(ranking).precision[2]) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize(("number", "expected"), [(9, 0.3), (10, 1.0), (11, 1.0)])
+@pytest.mark.parametrize(("number", "expected"), [(9, 0.3), (10, 1.0)])
 def test_errors_require_a_recall_above_a_tenth(number, expected):
     curves = class_curves(ranked(cars((0.3, 0.9)), cars(*((20.0 * i, -1.0) for i in range(number))))[0])
     assert metrics.mean_error(curves.errors[0], curves.confidence[2]) == pytest.approx(expected)
@@ -103,8 +103,7 @@ def test_the_first_truth_wins_among_equal_distances(near, expected):
     assert ranking.errors[1, 0] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("ties", [True, False])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("seed", "ties"), [(0, True), (1, False), (2, True), (3, False)])
 def test_all_numbers_match_loops(seed, ties):
     tables, results = make_task(seed, ties=ties, absent=("bus", "traffic_cone") if seed == 3 else ())
     truth = truth_of(tables)
@@ -130,13 +129,13 @@ def test_all_numbers_are_defined_without_truth_or_predictions():
 
 
 def test_numpy_numbers_and_arrays_are_accepted():
-    results, truth = task()
-    for boxes in results["results"].values():
-        for box in boxes:
-            box["translation"] = np.array(box["translation"])
-            box["detection_score"] = np.float64(box["detection_score"])
-    plain, _ = task()
-    assert evaluate_detections(results, truth)["nd_score"] == evaluate_detections(plain, truth)["nd_score"]
+    plain, truth = task()
+    arrays = {
+        token: [{**box, "size": np.array(box["size"]), "velocity": np.array(box["velocity"])} for box in boxes]
+        for token, boxes in plain["results"].items()
+    }
+    scores = [evaluate_detections(each, truth)["nd_score"] for each in (plain, {**plain, "results": arrays})]
+    assert scores[0] == scores[1]
 
 
 def test_yaw_and_axes_of_quaternions_of_any_norm():
@@ -151,6 +150,11 @@ def evaluated(results, truth):
     return evaluate(read_results(results, read.tokens).boxes, read)
 
 
+@pytest.fixture(scope="module")
+def larger():
+    return evaluated(*task(1, samples=10, objects=40))
+
+
 def test_a_resampled_set_has_the_score_of_copied_samples():
     results, truth = task(2, ties=False)
     evaluation = evaluated(results, truth)
@@ -161,21 +165,19 @@ def test_a_resampled_set_has_the_score_of_copied_samples():
     assert_numbers(ours, score(found, true))
 
 
-def test_bootstrap_intervals_contain_the_score_and_depend_only_on_the_seed():
-    evaluation = evaluated(*task(1, samples=10, objects=80))
-    first, again, other = (bootstrap(evaluation, repeats=60, seed=s) for s in (0, 0, 1))
+def test_bootstrap_intervals_contain_the_score_and_depend_only_on_the_seed(larger):
+    first, again, other = (bootstrap(larger, repeats=20, seed=s) for s in (0, 0, 1))
     assert first == again != other
     for key in ("mean_ap", "nd_score"):
-        assert first[key]["low"] < evaluation.summary[key] < first[key]["high"]
+        assert first[key]["low"] < larger.summary[key] < first[key]["high"]
 
 
-def test_examples_are_ordered_by_quality():
-    evaluation = evaluated(*task(1, samples=10, objects=80))
-    chosen = choose_examples(evaluation)
+def test_examples_are_ordered_by_quality(larger):
+    chosen = choose_examples(larger)
     shown = {}
     for name, row in chosen.rows.items():
         hits = boxes = 0
-        for ranking in evaluation.rankings:
+        for ranking in larger.rankings:
             confident = (ranking.sample == row) & (ranking.score >= chosen.min_score)
             hits += (ranking.hit[2] & confident).sum()
             boxes += confident.sum() + (ranking.truth_sample == row).sum()

@@ -9,7 +9,6 @@ from made_evaluation import random_boxes
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.evaluation import evaluate_detections
 from fcos_lidar_jax.evaluation.results import USE_FLAGS, attribute_of, read_results, result_entries, write_results
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.evaluation.truth import read_truth
@@ -40,28 +39,16 @@ def document(**changes):
 
 BOXES = {
     "unknown class": ({"detection_name": "tram"}, r"detection_name: got 'tram', expected one of car, truck"),
-    "rack predicted": ({"detection_name": "static_object.bicycle_rack"}, "detection_name: got 'static_object"),
-    "class a number": ({"detection_name": 3}, "detection_name: expected `str`, got `int`"),
-    "NaN score": ({"detection_score": float("nan")}, r"detection_score: expected `float`, got null or NaN"),
     "infinite score": ({"detection_score": float("inf")}, "detection_score: expected `float`, got `str`"),
-    "string score": ({"detection_score": "0.5"}, "detection_score: expected `float`, got `str`"),
     "negative score": ({"detection_score": -0.5}, r"detection_score: got -0\.5, expected a finite number"),
-    "score a truth value": ({"detection_score": True}, "detection_score: expected `float`, got `bool`"),
     "no score": ({"detection_score": "left out"}, "object missing required field `detection_score`"),
     "zero size": ({"size": [2, 0, 1]}, r"size: got \[2\.0, 0\.0, 1\.0\], expected three positive lengths"),
-    "negative size": ({"size": [2, 4, -1]}, r"size: got \[2\.0, 4\.0, -1\.0\], expected three positive"),
     "two sizes": ({"size": [2, 4]}, "size: expected `array` of length 3$"),
     "NaN size": ({"size": [2, float("nan"), 1]}, r"size\[1\]: expected `float`, got null or NaN"),
     "far away": ({"translation": [1e300, 0, 0]}, r"translation: got .*, expected numbers of at most 1e\+08"),
     "vanishing quaternion": ({"rotation": [1e-200, 0, 0, 0]}, "rotation: got .*, expected a nonzero quaternion"),
-    "zero quaternion": ({"rotation": [0, 0, 0, 0]}, "rotation: got .*, expected a nonzero quaternion w, x, y, z"),
-    "yaw for rotation": ({"rotation": 0.3}, "rotation: expected `array`, got `float`"),
-    "NaN translation": ({"translation": [1, float("nan"), 0]}, r"translation\[1\]: expected `float`, got null"),
-    "huge translation": ({"translation": [1, float("inf"), 0]}, r"translation\[1\]: expected `float`, got `str`"),
-    "three velocities": ({"velocity": [1, 2, 3]}, "velocity: expected `array` of length 2$"),
     "infinite velocity": ({"velocity": [1, float("-inf")]}, r"velocity\[1\]: expected `float \| null`, got `str`"),
     "fast": ({"attribute_name": "fast"}, "attribute_name: got 'fast', expected one of cycle.* or nothing"),
-    "null attribute": ({"attribute_name": None}, "attribute_name: expected `str`, got null"),
     "other sample": ({"token": "a"}, "sample_token: got 'a', expected 'b'"),
 }
 
@@ -77,30 +64,17 @@ def results_of(empty="", **samples):
 
 FILES = {
     **{name: (document(**changes), f"sample b: box 1: {message}") for name, (changes, message) in BOXES.items()},
-    "missing token": (results_of("ac"), "sample b: missing: expected the 3 samples of split 'val'"),
     "missing tokens": (results_of("a"), "sample b and 1 more: missing"),
     "extra": (results_of("abcde"), "sample d and 1 more: not expected: expected the 3 samples of split 'val'"),
     "501 boxes": (results_of("bc", a=[box("a")] * 501), "sample a: box 500: got 501 boxes, expected at most 500"),
-    "twice": (
-        b'{"meta": {}, "results": {"a": [], "b": [],\n "b" : [], "a": []}}',
-        "results: sample a: occurs twice",
-    ),
-    "twice at the end": (
-        b'{"meta": {}, "results": {"a": [], "b": [], "b": []}}',
-        "results: sample b: occurs twice",
-    ),
-    "sample an object": (results_of(a={}), "sample a: expected `array`, got `object`"),
+    "twice": (b'{"meta": {}, "results": {"a": [], "b": [], "b" : []}}', "results: sample b: occurs twice"),
     "box a list": (results_of(a=[[]]), "sample a: box 0: expected `object`, got `array`"),
-    "results a list": ({"meta": {}, "results": []}, "results: expected `object`, got `array`"),
     "no results": ({"meta": {}}, "object missing required field `results`"),
-    "no meta": ({"results": {}}, "object missing required field `meta`"),
     "flag": ({"results": {}, "meta": {"use_lidar": "yes"}}, "meta: use_lidar: got 'yes', expected true or false"),
-    "not JSON": (b"{'meta': {}}", "not JSON: .*byte 1"),
     "cut": (json.dumps(document()).encode()[:-9], "not JSON: .*truncated"),
     "too large": (spelt("detection_score", b"1e999"), "sample b: (box 1: detection_score: )?.*out of range"),
     "a broken letter": (spelt("detection_name", b'"x\xffz"'), "sample b: not JSON: "),
     "a broken letter in a token": (b'{"meta": {}, "results": {"a\xff": []}}', "(results: )?not JSON: "),
-    "nested without end": (b'{"meta": {"a": ' + b"[" * 100_000, "not JSON: .*recursion"),
     "nested in a box": (spelt("size", b"[" * 100_000 + b"]" * 100_000), "(sample b: )?not JSON: .*recursion"),
     "empty": (b"", "empty file"),
     "a list": (b"[]", "expected `object`, got `array`"),
@@ -151,15 +125,10 @@ def truth(**changes):
     ("source", "message"),
     [
         (truth(detection_name="animal"), "sample a: box 1: detection_name: got 'animal', expected one of c.*rack"),
-        (truth(attribute_name="new"), "sample a: box 1: attribute_name: got 'new'"),
         (truth(num_pts=-2), "sample a: box 1: num_pts: got -2, expected a count, or -1 for unknown"),
-        (truth(num_pts=None), "sample a: box 1: num_pts: expected `int`, got null"),
-        (truth(size=[0, 1, 1]), "sample a: box 1: size: got"),
         ({"a": {"boxes": []}}, "sample a: object missing required field `ego_translation`"),
         ({"a": {"ego_translation": [0, 0, float("nan")], "boxes": []}}, r"sample a: ego_translation\[2\]"),
-        ({"a": []}, "sample a: expected `object`, got `array`"),
         ({}, "got no sample"),
-        ([], "expected `object`, got `array`"),
     ],
 )
 def test_invalid_truth_is_named(source, message, tmp_path):
@@ -167,11 +136,6 @@ def test_invalid_truth_is_named(source, message, tmp_path):
     file.write_text(json.dumps(source))
     with pytest.raises(ValueError, match=rf"^{re.escape(str(file))}: {message}"):
         read_truth(file)
-
-
-def test_predictions_of_other_samples_are_rejected():
-    with pytest.raises(ValueError, match="results: sample a: missing; sample b and 1 more: not expected"):
-        evaluate_detections(results_of("bc"), truth())
 
 
 def test_attributes_depend_on_class_and_speed():

@@ -1,4 +1,4 @@
-"""Boxes in camera images: their lines, by a loop over points of their edges, and a report of KITTI."""
+"""Boxes in camera images: their lines, by a loop over points of their edges, and an example of KITTI."""
 
 import matplotlib.image
 import numpy as np
@@ -9,13 +9,12 @@ from refusal import refused
 
 from fcos_lidar_jax.data.frame import SelectedFrames
 from fcos_lidar_jax.data.kitti import CLASSES, KittiFrames
-from fcos_lidar_jax.evaluation.frames import evaluate_frames
-from fcos_lidar_jax.evaluation.metrics import metric_of
-from fcos_lidar_jax.evaluation.summary import write_evaluation
+from fcos_lidar_jax.evaluation.frames import frame_columns
+from fcos_lidar_jax.evaluation.metrics import evaluate, metric_of
 from fcos_lidar_jax.types import Detections
-from fcos_lidar_jax.visualization import camera
+from fcos_lidar_jax.visualization import camera, evaluation_report
 from fcos_lidar_jax.visualization.camera import draw_camera
-from fcos_lidar_jax.visualization.evaluation_report import make_examples, write_evaluation_report
+from fcos_lidar_jax.visualization.evaluation_report import make_examples
 from fcos_lidar_jax.visualization.figure import class_color
 
 LOOK = np.array([[50.0, -100, 0, 0], [30, 0, -100, 0], [1, 0, 0, 0]])  # along x, 100 pixels wide, 60 high
@@ -91,7 +90,7 @@ def test_colours_labels_and_boxes_behind_the_camera(image, drawn):
     assert [text.get_text() for text in axis.texts] in (["Car 0.75"], ["0.75"])
 
 
-@pytest.mark.parametrize("content", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(40)])
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n" + bytes(40)])
 def test_a_damaged_image_is_named(image, content):
     image.write_bytes(content)
     with refused(str(image), "expected a PNG or JPEG image"):
@@ -106,7 +105,7 @@ def test_a_damaged_image_is_named(image, content):
 
 
 @pytest.mark.slow
-def test_a_report_of_kitti_has_boxes_in_the_camera_images(tmp_path):
+def test_an_example_of_kitti_has_boxes_in_the_camera_image(tmp_path):
     make_kitti(tmp_path / "kitti", train=1, val=1)
     frames = SelectedFrames(KittiFrames(tmp_path / "kitti"), (1, 0))
     assert frames.camera(0) is None
@@ -118,13 +117,14 @@ def test_a_report_of_kitti_has_boxes_in_the_camera_images(tmp_path):
     for frame in truth:
         ones = np.ones(len(frame.boxes))
         found.append(Detections(frame.boxes, ones.astype(np.float32), frame.labels, ones > 0, np.int32(0)))
-    evaluation = evaluate_frames(found, truth, metric_of(CLASSES))
-    write_evaluation(tmp_path, evaluation, {})
+    evaluation = evaluate(*frame_columns(found, truth, ["000001", "000000"]), metric_of(CLASSES))
     examples = make_examples(evaluation, frames, np.zeros((2, 3)), {"best": 0, "worst": 1}, min_score=0.3)
-    write_evaluation_report(tmp_path, title="t", num_samples=2, examples=examples, sensor=frames.sensor)
-    assert [path.name for path in sorted((tmp_path / "pictures").glob("*_camera.png"))] == ["best_camera.png"]
-    assert "best sample&#x27;s camera image" in (tmp_path / "report.html").read_text()
-    picture = (matplotlib.image.imread(tmp_path / "pictures" / "best_camera.png")[..., :3] * 255).round()
+    ranges_m = dict.fromkeys(CLASSES, 50.0)
+    views, images = evaluation_report._draw_examples(tmp_path, examples, ranges_m, frames.sensor)
+    names = ["best_bev.png", "worst_bev.png", "best_camera.png", "best_range.png", "worst_range.png"]
+    assert [file.name for _, file in (*views, *images)] == names
+    assert all(("000001" if "best" in caption else "000000") in caption for caption, _ in views)
+    picture = (matplotlib.image.imread(tmp_path / "best_camera.png")[..., :3] * 255).round()
     label = int(truth[0].labels[0])
     color = list(bytes.fromhex(class_color(label)[1:]))
     rows, columns = np.nonzero(np.abs(picture - color).max(axis=2) < 40)

@@ -86,8 +86,9 @@ def canvas(tab):
     return tab.picture()
 
 
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize(
+    ("width", "dark"), [(1280, False), (390, True)], ids=["wide and light", "narrow and dark"]
+)
 def test_the_page_draws_fits_and_makes_no_requests(browser, page, width, dark):
     with open_tab(browser, page.as_uri(), width=width, dark=dark) as tab:
         assert state(tab) == "frame 1 of 3, 0.00 s, 2 boxes, 1 in truth"

@@ -61,13 +61,6 @@ def test_boxes_of_low_score_are_left_out_and_truth_is_recorded(tmp_path):
     np.testing.assert_array_equal(columns["/sensor/truth", "centers"][0], BOXES[::-1, :3])
 
 
-def test_a_failed_recording_leaves_no_file(tmp_path):
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    with pytest.raises(KeyboardInterrupt), rerun_recording(tmp_path / "drive.rrd", ("car",)):
-        raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_without_rerun_one_line_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ValueError, match=r"^--rrd: rerun is not installed.*pip install -e '\.\[viz\]' in"):

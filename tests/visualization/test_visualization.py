@@ -67,7 +67,7 @@ def bicycle(*box):
     return np.array([[*box, 0, 0]], float), np.array([BICYCLE])
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.5, np.pi / 2, np.pi, -2.0])
+@pytest.mark.parametrize("yaw", [0.5, -2.0])
 def test_a_box_is_drawn_with_its_colour_position_and_heading(tmp_path, yaw):
     view = View(tmp_path, detections=(*bicycle(-8, 12, 0, 10, 4, 1, yaw), np.array([0.5])))
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -106,18 +106,17 @@ def test_any_number_of_classes_has_colours_and_a_legend(tmp_path):
     assert not len(places(view.legend, class_color(30)))
 
 
-def test_higher_points_are_darker_and_empty_clouds_are_accepted(tmp_path):
+def test_higher_points_are_darker(tmp_path):
     ground = np.stack([np.linspace(-20, 20, 400), np.full(400, -10), np.full(400, -1.8)], 1)
     view = View(tmp_path, np.concatenate([ground, ground + np.array([0, 20, 3])]))
     assert view.at(7, 10).mean() < view.at(7, -10).mean() - 20
-    View(tmp_path, np.zeros((0, 3)))
 
 
-def small_image(cells, *, lag=0.0, rounds=1):
+def small_image(cells):
     """A range image with one point at x = 10 m in each given cell."""
-    features = np.zeros((8, 16, 9, rounds), np.float32)
+    features = np.zeros((8, 16, 9, 1), np.float32)
     for row, column in cells:
-        values = {"x": 10, "range": 10, "intensity": 99, "existence": 1, "time_lag": lag, "inclination": -row / 10}
+        values = {"x": 10, "range": 10, "intensity": 99, "existence": 1, "inclination": -row / 10}
         features[row, column, :, 0] = [values.get(name, 0) for name in CHANNELS]
     return SimpleNamespace(features=features)
 
@@ -139,17 +138,9 @@ def test_filled_cells_are_coloured_and_empty_cells_are_grey(tmp_path):
             assert grey == ((row, column) not in [(2, 4), (7, 15)]), (row, column)
 
 
-@pytest.mark.parametrize(("rounds", "lag", "expected"), [(3, 0.0, 4), (1, 0.1, 3)])
-def test_panels_show_all_rounds_and_nonzero_time_lags(tmp_path, rounds, lag, expected):
-    assert len(draw(tmp_path, small_image([(2, 4)], lag=lag, rounds=rounds), title="t")[1]) == expected
-
-
 def test_boxes_are_outlined_around_their_cells(tmp_path):
     image = small_image([(2, 4), (3, 5)])
     around = np.array([[10, 0, 0, 1, 1, 1, 0, 0, 0], [-10, 0, 0, 1, 1, 1, 0, 0, 0]], np.float32)
-    for boxes in (None, around[1:]):
-        truth = None if boxes is None else (boxes, [BICYCLE])
-        assert not len(places(draw(tmp_path, image, truth=truth, classes=NUSCENES_CLASSES)[0], GREEN))
     truth = around, [BICYCLE, CAR]
     picture, [(top, bottom, left, right), _] = draw(tmp_path, image, truth=truth, classes=[" "] * 10)
     green = places(picture, GREEN)
@@ -186,21 +177,10 @@ def test_rows_are_labelled_with_the_inclination_of_their_points():
     assert not _row_inclinations(small_image([]).features).any()
 
 
-def test_curves_rise_with_their_values(tmp_path):
-    series = {"a": [(x, 10**x) for x in np.linspace(0, 2, 100)]}
-    draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=True)
-    found = places(pixels(tmp_path / "c.png"), "#0072b2")
-    found = found[np.bincount(found[:, 0])[found[:, 0]] < 15]  # without the horizontal line of the legend
-    (bottom, left), (top, right) = found[found[:, 1].argmin()], found[found[:, 1].argmax()]
-    middle = found[np.abs(found[:, 1] - (left + right) / 2) < 3, 0]
-    assert top < bottom - 200
-    assert np.abs(middle - (top + bottom) / 2).min() < 5  # 10 halfway between 1 and 100
-
-
 @pytest.mark.parametrize(
     "series",
-    [{}, {"a": []}, {"a": [(1, 2)]}, {"a": [(1, float("nan")), (2, 0), (3, -1)], "b": [(1, 1)] * 99}],
-    ids=["none", "empty", "one", "gaps"],
+    [{}, {"a": [], "b": [(1, float("nan")), (2, 0), (3, -1)], "c": [(1, 1)] * 99}],
+    ids=["none", "gaps"],
 )
 def test_empty_and_incomplete_curves_are_drawn(tmp_path, series):
     draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=True)
