@@ -77,9 +77,6 @@ class NuScenes:
     ) -> None:
         self.root, self.version, self.allow_missing_sweeps = Path(root), version, allow_missing_sweeps
         self.follow_links = follow_links
-        if not self.root.is_dir():
-            raise ValueError(f"{root}: no such folder, expected a data root")
-        check_version(self.root, version)
         folder = default_index(root, version) if index is None else Path(index)
         known = index is not None or has_index(folder)
         self.index: Index = open_index(folder, tables=self.tables) if known else build_index(self.tables)
@@ -101,15 +98,12 @@ class NuScenes:
         ``file`` is ``{"name": ["scene", ...]}``; default: the version's ``splits.json``, or the official splits.
 
         Raises:
-            ValueError: no such split, an unknown scene, or no keyframe.
+            ValueError: no such split, a split without scenes, or an unknown scene.
         """
         row = {str(scene): i for i, scene in enumerate(self.index.scene_name)}
         scenes = scenes_of_split(name, self.tables, row, file=file)
         selected = np.isin(self.index.sample_scene, [row[scene] for scene in scenes])
-        tokens = [token for token, yes in zip(self._sample_row, selected, strict=True) if yes]
-        if not tokens:
-            raise ValueError(f"{self.tables}: split {name!r}: got no keyframe, expected at least one")
-        return tokens
+        return [token for token, yes in zip(self._sample_row, selected, strict=True) if yes]
 
     def scene_of(self, sample_token: str) -> str:
         return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
@@ -163,10 +157,7 @@ class NuScenes:
         names = self.index.scene_name.astype(str).tolist()
         if scene not in names:
             raise ValueError(f"{self.tables}: scene: {unknown_name(scene, names)}")
-        rows = self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
-        if not rows:
-            raise ValueError(f"{self.tables / 'sample.json'}: scene {scene}: found no keyframe, expected one")
-        return rows
+        return self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
 
     def _scene_rows(self, scene: str) -> list[int]:
         last = self._keyframe_rows(scene)[-1]
@@ -359,13 +350,6 @@ class NuScenesFrames(FrameSet):
     def fingerprint(self) -> str:
         how = dataclasses.astuple(self.reading)
         return checksum(repr((column_checksums(self.nuscenes.index), self.tokens, how)).encode())
-
-
-def check_version(root: Path, version: str) -> None:
-    """Refuse a version without a folder in the root; the message lists those that there are."""
-    if not (root / version).is_dir():
-        there = sorted(file.parent.name for file in root.glob("*/sample.json"))
-        raise ValueError(f"{root / version}: no such folder, expected one of {', '.join(there) or 'none here'}")
 
 
 def open_keyframes(
