@@ -154,15 +154,6 @@ def test_intensities_are_brought_to_the_scale_of_the_network_by_a_given_factor(r
         open_frames(root, intensity_scale=8.0)
 
 
-def test_kitti_is_cropped_to_the_image_unless_the_full_turn_is_wanted(roots):
-    cropped, whole = open_frames(roots["kitti"]), open_frames(roots["kitti"], full_turn=True)
-    raw = np.fromfile(roots["kitti"] / "training" / "velodyne" / "000000.bin", np.float32).reshape(-1, 4)
-    np.testing.assert_array_equal(whole.frame(0).points[:, :3], raw[:, :3])
-    assert (whole.frame(0).points[:, 0] < 0).any()
-    assert (cropped.frame(0).points[:, 0] > 0).all()
-    assert cropped.fingerprint() != whole.fingerprint()
-
-
 def test_a_class_map_renames_and_drops_classes(roots):
     frames = open_frames(roots["folder"], class_map={"person": None, "post": "pole"})
     assert frames.classes == ("pole", "vehicle")
@@ -190,32 +181,6 @@ def test_class_maps_cover_all_classes_and_lead_to_classes_of_the_other_data():
     assert len(signs_and_riders) == 12
     assert {"SIGN", "STOP_SIGN", "BOLLARD", "BICYCLIST", "MOTORCYCLIST", "WHEELED_RIDER"} < set(signs_and_riders)
     assert not left_out
-
-
-WORDS = {
-    "kitti": {"car": "Car Van", "bus": "Tram", "pedestrian": "Pedestrian Person_sitting", "bicycle": "Cyclist"},
-    "nuscenes": {"Car": "car", "Truck": "truck", "Pedestrian": "pedestrian", "Cyclist": "bicycle"},
-    "argoverse2": {
-        "car": "REGULAR_VEHICLE",
-        "truck": "LARGE_VEHICLE TRUCK BOX_TRUCK TRUCK_CAB",
-        "bus": "BUS SCHOOL_BUS ARTICULATED_BUS",
-        "trailer": "VEHICULAR_TRAILER MESSAGE_BOARD_TRAILER",
-    },
-}
-"""Format -> class of the other data -> its classes."""
-
-
-@pytest.mark.parametrize("format", WORDS)
-def test_a_class_map_can_be_chosen_by_name(roots, format):
-    name = "kitti" if format == "nuscenes" else "nuscenes"
-    plain, mapped = open_frames(roots[format]), open_frames(roots[format], class_map=name)
-    for i in range(len(plain)):
-        own = [plain.classes[label] for label in plain.labels(i)]
-        new = [mapped.classes[label] for label in mapped.labels(i)]
-        for to, of in WORDS[format].items():
-            assert new.count(to) == sum(map(own.count, of.split()))
-    assert set(WORDS[format]) <= set(mapped.classes)
-    assert mapped.labels(0).size > 0
 
 
 @pytest.mark.parametrize("format", FORMATS)
