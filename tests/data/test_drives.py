@@ -223,7 +223,7 @@ def test_missing_sweeps_are_skipped_if_allowed_but_a_scene_needs_keyframes(tmp_p
     scenes = root / VERSION / "scene.json"
     rows = json.loads(scenes.read_text())
     scenes.write_text(json.dumps([*rows, rows[0] | {"token": "9" * 32, "name": "scene-9"}]))
-    with refused("scene.json: record ", ": no record of sample.json refers to it"):
+    with refused("sample.json: scene scene-9: found no keyframe, expected one"):
         NuScenes(root, VERSION).drive("scene-9")
 
 

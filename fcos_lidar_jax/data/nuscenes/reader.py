@@ -98,12 +98,15 @@ class NuScenes:
         ``file`` is ``{"name": ["scene", ...]}``; default: the version's ``splits.json``, or the official splits.
 
         Raises:
-            ValueError: no such split, a split without scenes, or an unknown scene.
+            ValueError: no such split, an unknown scene, or no keyframe.
         """
         row = {str(scene): i for i, scene in enumerate(self.index.scene_name)}
         scenes = scenes_of_split(name, self.tables, row, file=file)
         selected = np.isin(self.index.sample_scene, [row[scene] for scene in scenes])
-        return [token for token, yes in zip(self._sample_row, selected, strict=True) if yes]
+        tokens = [token for token, yes in zip(self._sample_row, selected, strict=True) if yes]
+        if not tokens:
+            raise ValueError(f"{self.tables}: split {name!r}: got no keyframe, expected at least one")
+        return tokens
 
     def scene_of(self, sample_token: str) -> str:
         return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
@@ -157,7 +160,10 @@ class NuScenes:
         names = self.index.scene_name.astype(str).tolist()
         if scene not in names:
             raise ValueError(f"{self.tables}: scene: {unknown_name(scene, names)}")
-        return self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
+        rows = self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
+        if not rows:
+            raise ValueError(f"{self.tables / 'sample.json'}: scene {scene}: found no keyframe, expected one")
+        return rows
 
     def _scene_rows(self, scene: str) -> list[int]:
         last = self._keyframe_rows(scene)[-1]
