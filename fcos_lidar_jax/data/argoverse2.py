@@ -17,7 +17,6 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_poi
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, check_poses, fuse_sweeps
-from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.geometry import pose_matrix, wrap_angle
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
 
@@ -73,13 +72,11 @@ class Argoverse2Frames(FrameSet):
         reading: CloudReading = CloudReading(),
     ) -> None:
         self.root, self.sensor, self.reading = Path(root), sensor, reading
-        splits = find_splits(self.root)
-        if split is not None and split not in splits:
-            raise ValueError(f"{self.root}: split: {unknown_name(split, splits)}")
-        folders = [self.root / split] if split is not None else [self.root, *(self.root / s for s in splits)]
+        splits = [self.root / name for name in find_splits(self.root)]
+        folders = [self.root, *splits] if split is None else [self.root / split]
         logs = [log for folder in folders for log in _logs(folder)]
         if not logs:
-            raise ValueError(f"{self.root}: no log in it, expected folders with {_SWEEPS}")
+            raise ValueError(f"{folders[0]}: no log in it, expected folders with {_SWEEPS}")
         self._sweeps = [(log, stamp, place) for log in logs for place, stamp in enumerate(_stamps(log))]
 
     def __len__(self) -> int:
@@ -182,11 +179,10 @@ class _Poses:
 
     def at(self, time_ns: np.ndarray | int) -> np.ndarray:
         """f64[..., 4, 4] at exact times."""
-        rows = np.minimum(np.searchsorted(self.time_ns, time_ns), len(self.time_ns) - 1)
-        missing = np.extract(self.time_ns[rows] != time_ns, time_ns)
+        missing = np.setdiff1d(time_ns, self.time_ns)
         if len(missing):
             raise ValueError(f"{self.file}: no pose at {missing[0]} ns, expected one for every sweep and box")
-        return self.matrices[rows]
+        return self.matrices[np.searchsorted(self.time_ns, time_ns)]
 
 
 class _Boxes(NamedTuple):
@@ -214,8 +210,6 @@ def _cached_log(pose_file: Path, box_file: Path, *states: object) -> tuple[_Pose
 def _read_poses(file: Path) -> _Poses:
     table, matrices = _read_table(file, _POSE)
     time_ns, first = np.unique(table["timestamp_ns"], return_index=True)
-    if not len(time_ns):
-        raise ValueError(f"{file}: no row in it, expected the poses of the ego vehicle")
     return _Poses(file, time_ns, matrices[first])
 
 

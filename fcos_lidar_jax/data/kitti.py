@@ -273,9 +273,7 @@ def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
 
 
 def _stems(folder: Path, ending: str) -> set[str]:
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder, expected one with {ending} files")
-    stems = {file.stem for file in folder.iterdir() if file.suffix == ending}
+    stems = {file.stem for file in folder.glob(f"*{ending}")}
     if not stems:
         raise ValueError(f"{folder}: no {ending} file in it, expected at least one")
     return stems

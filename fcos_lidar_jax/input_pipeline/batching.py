@@ -72,8 +72,8 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
         vehicle stay: readers remove them, and :func:`~fcos_lidar_jax.data.frame.drop_close` from your own arrays.
 
     Raises:
-        ValueError: no frame, arrays that do not fit each other, an implausible box, or a frame that is too large;
-            nothing is truncated.
+        ValueError: arrays that do not fit each other, an implausible box, or a frame that is too large; nothing is
+            truncated.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -84,10 +84,6 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     ... ]
     ((2, 4096, 5), (2, 64, 9), True)
     """
-    if isinstance(frames, Frame):
-        raise ValueError("frames: got a Frame, expected a list of frames")
-    if not frames:
-        raise ValueError("frames: got none, expected at least one")
     columns = frames[0].points.shape[-1]
     for row, frame in enumerate(frames):
         _check_frame(f"frame {row}", frame, columns)

@@ -39,22 +39,17 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
     if (of_class < 0).all():
         got, expected = ", ".join(manifest.classes), ", ".join(config.classes)
         raise ValueError(f"{objects.folder}: classes: got {got}, expected some of {expected}")
-    boxes, labels = objects.table["box"], of_class[objects.table["label"]]
-    current, pasted = objects.num_points(1), objects.num_points(config.num_sweeps)
     sweeps = config.num_sweeps
     expected = (
         f"at most the {manifest.num_sweeps} of {objects.folder}: run fcos-lidar prepare --num-sweeps {sweeps}"
     )
     check(sweeps <= manifest.num_sweeps, "num_sweeps", sweeps, expected)
+    boxes, labels = objects.table["box"], of_class[objects.table["label"]]
+    current, pasted = objects.num_points(1), objects.num_points(sweeps)
     usable = (pasted >= min_points) & (current >= 1)
     pools = [np.flatnonzero(usable & (labels == label)) for label in range(len(targets))]
 
     def paste(frame: Frame, rng: np.random.Generator) -> tuple[Frame, np.ndarray]:
-        if len(objects) and frame.points.shape[1] != manifest.columns:
-            raise ValueError(
-                f"{objects.folder}: got points of {manifest.columns} columns, expected "
-                f"{frame.points.shape[1]} as in the frames"
-            )
         present = np.bincount(frame.labels[frame.num_points >= 1], minlength=len(pools))
         missing = np.maximum(np.array(targets) - present, 0)
         sampled = [

@@ -148,13 +148,8 @@ def make_batches(
         an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows; it raises the errors of
         unreadable frames.
     """
-    check(0 <= first_step <= num_steps, "first_step", first_step, f"0 to {num_steps}")
     threads = default_threads(workers) if threads is None else threads
     size = config.optimizer.batch_size
-    if not 0 <= process_index < num_processes or size % num_processes:
-        raise ValueError(
-            f"process {process_index} of {num_processes}: expected a number that divides the batch of {size}"
-        )
     order = order or SampleOrder(frames, config, seed=seed)
     batch_of = _BatchOf(
         frames=frames,

@@ -13,7 +13,7 @@ from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
-from fcos_lidar_jax.data.nuscenes.reader import check_version, open_keyframes
+from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.data.recorded import check_scale
 from fcos_lidar_jax.data.splits import own_splits
@@ -146,7 +146,8 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
     if not version and len(versions) != 1:
         raise ValueError(f"{root}: got versions {', '.join(versions) or '(none)'}, expected one: name it")
     version = version or versions[0]
-    check_version(data.root, version)
+    if not (data.root / version).is_dir():
+        raise ValueError(f"{data.root / version}: no such folder, expected one of {', '.join(versions) or 'none'}")
     return dataclasses.replace(data, version=version)
 
 

@@ -131,10 +131,8 @@ def test_frames_of_several_logs_have_scene_name_time_and_pose(root):
     for split, number in (("train", 4), ("val", 2)):
         assert len(Argoverse2Frames(root, split)) == number
     assert len(Argoverse2Frames(root / "val")) == len(Argoverse2Frames(root / "val" / "log-b")) == 2
-    with refused("split: got 'vall', expected val"):
+    with refused(f"{root}/vall: no log in it, expected folders with sensors/lidar"):
         Argoverse2Frames(root, "vall")
-    with refused("no log in it, expected folders with sensors/lidar"):
-        Argoverse2Frames(root / "train" / "log-a" / "sensors")
 
 
 def test_annotations_are_read_again_after_a_change_and_may_be_missing(root):
@@ -174,14 +172,10 @@ def boxes(**changes):
 ONE = np.array([1, 0, 0, 0.0])
 BAD = {
     "no poses": (lambda log: (log / P).unlink(), P, "cannot be read: No such file or directory"),
-    "no Feather": (rewrite(P, lambda _: b"timestamp_ns,qw"), P, "not a readable .feather file: "),
     "empty": (rewrite(P, lambda _: b""), P, "empty file"),
     "cut": (rewrite(A, lambda content: content[:-40]), A, "not a readable .feather file: "),
-    "cut sweep": (rewrite(S, lambda content: content[:-40]), S, "not a readable .feather file: "),
     "no column": (change(P, qz=None), P, 'Field "qz" does not exist'),
-    "no intensity": (change(S, intensity=None), S, 'Field "intensity" does not exist'),
     "text": (change(S, x=["one"] * 4), S, "x: got string, expected numbers"),
-    "no text": (change(A, category=[1] * 2), A, "category: got int64, expected texts"),
     "missing value": (change(S, y=[1.0, None, 2, 3]), S, "y: got 1 rows without a value, expected numbers"),
     "fraction": (change(A, timestamp_ns=[0.5, 1.0]), A, "timestamp_ns: got double, expected whole numbers"),
     "no rotation": (change(P, qw=2 * ONE), P, "row 0: rotation: got [2.0, "),

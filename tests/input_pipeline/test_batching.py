@@ -20,10 +20,6 @@ def test_frames_are_padded_and_nothing_is_truncated():
         np.testing.assert_array_equal(batch.labels[row][batch.box_valid[row]], frame.labels)
     with pytest.raises(ValueError, match=rf"^frame 0: points: got {len(frames[0].points)}, expected at most 9$"):
         fcos.input_pipeline.make_batch(frames, max_points=9, max_boxes=64)
-    with pytest.raises(ValueError, match=r"^frames: got a Frame, expected a list of frames$"):
-        fcos.input_pipeline.make_batch(frames[0], max_points=9, max_boxes=64)
-    with pytest.raises(ValueError, match=r"^frames: got none"):
-        fcos.input_pipeline.make_batch([], max_points=9, max_boxes=64)
 
 
 FRAME = SimulatedFrames(TINY, 1).frame(0)

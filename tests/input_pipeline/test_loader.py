@@ -81,18 +81,15 @@ def alone(objects):
     "how",
     [
         {"threads": 4, "first_step": 1},
-        {"workers": 2, "threads": 2, "first_step": 3},
         {"first_step": STEPS},
     ],
 )
-def test_batches_do_not_depend_on_threads_workers_or_the_first_step(objects, alone, how):
+def test_batches_do_not_depend_on_threads_or_the_first_step(objects, alone, how):
     assert_same(run(config=CONFIG, objects=objects, **how), alone[how.get("first_step", 0) :])
 
 
-@pytest.mark.parametrize("num_processes", [2, 4])
-def test_the_rows_of_all_processes_form_the_global_batch(objects, alone, num_processes):
-    options = {"config": CONFIG, "objects": objects, "num_processes": num_processes}
-    parts = [run(**options, process_index=i) for i in range(num_processes)]
+def test_the_rows_of_all_processes_form_the_global_batch(objects, alone):
+    parts = [run(config=CONFIG, objects=objects, num_processes=4, process_index=i) for i in range(4)]
     for step, batch in enumerate(alone):
         joined = jax.tree.map(lambda *rows: np.concatenate(rows), *(p[step].batch for p in parts))
         for a, b in zip(jax.tree.leaves(joined), jax.tree.leaves(batch.batch), strict=True):
@@ -102,7 +99,7 @@ def test_the_rows_of_all_processes_form_the_global_batch(objects, alone, num_pro
 
 @pytest.mark.parametrize(
     ("cores", "workers", "threads"),
-    [(1, 0, 1), (2, 0, 2), (3, 0, 2), (8, 0, 7), (17, 0, 16), (128, 0, 16), (2, 2, 1), (32, 4, 4), (4, 16, 1)],
+    [(1, 0, 1), (2, 0, 2), (3, 0, 2), (128, 0, 16), (32, 4, 4), (4, 16, 1)],
 )
 def test_the_default_number_of_threads_depends_on_the_cores(monkeypatch, cores, workers, threads):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
@@ -118,9 +115,8 @@ def seen_frames(batches, size=7):
     return [first[tuple(np.asarray(points[0]).tolist())] for b in batches for points in b.batch.points]
 
 
-@pytest.mark.parametrize("class_balanced", [False, True])
-def test_batches_follow_the_order_of_samples_also_after_resuming(class_balanced):
-    config = dataclasses.replace(PLAIN, class_balanced=class_balanced)
+def test_batches_follow_the_order_of_samples_also_after_resuming():
+    config = dataclasses.replace(PLAIN, class_balanced=True)
     order, an_epoch = SampleOrder(ToyFrames(), config, seed=0), steps_per_epoch(ToyFrames(), config)
     steps = 2 * an_epoch
     batches = run(config=config, num_steps=steps)
@@ -224,12 +220,10 @@ def test_boxes_with_the_fewest_points_are_truncated_first_and_counted():
     assert tight.counts["truncated_boxes"] == lost > 4
 
 
-def test_the_laser_column_is_kept(objects):
+def test_the_laser_column_is_kept():
     frames = InMemoryFrames((toy_frame(0, columns=6),), ARGOVERSE2, NUSCENES_CLASSES)
     [batch] = run(frames, count=1)
     assert batch.batch.points.shape == (4, 3000, 6)
-    with refused("got points of 5 columns, expected 6 as in the frames"):
-        run(frames, CONFIG, objects=objects, count=1)
 
 
 def test_a_frame_without_boxes_and_points_gives_an_empty_sample():
@@ -241,11 +235,14 @@ def test_a_frame_without_boxes_and_points_gives_an_empty_sample():
 
 LEFT_EARLY = """
 import dataclasses
-from test_loader import PLAIN, STEPS, ToyFrames, make_batches
+from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.presets import QUICKSTART
+from toy_frames import ToyFrames
 if __name__ == "__main__":
-    large = dataclasses.replace(PLAIN, max_points=300_000)  # shared memory of this size is freed slowly
-    with make_batches(ToyFrames(), large, seed=0, num_steps=STEPS, workers=1) as batches:
-        print(len(next(batches).names), len(next(batches).names))
+    # Shared memory of this size is freed slowly.
+    large = dataclasses.replace(QUICKSTART, max_points=300_000, class_balanced=False)
+    with make_batches(ToyFrames(), large, seed=0, num_steps=6, threads=1, workers=1) as batches:
+        print(len({next(batches).batch.points.shape, next(batches).batch.points.shape}))
 """
 
 
@@ -254,14 +251,13 @@ def test_a_run_that_ends_early_prints_no_warning(tmp_path):
     script = tmp_path / "leave.py"
     script.write_text(LEFT_EARLY)
     done = run_python(script)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "4 4\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
 
 
 @pytest.mark.slow
-def test_workers_ignore_the_signals_that_the_main_process_handles(alone, objects):
-    with make_batches(
-        ToyFrames(), CONFIG, seed=0, num_steps=STEPS, threads=0, objects=objects, workers=1
-    ) as stream:
+def test_batches_of_workers_are_the_same_and_signals_are_left_to_the_main_process(alone, objects):
+    options = {"seed": 0, "num_steps": STEPS, "threads": 2, "objects": objects, "workers": 2}
+    with make_batches(ToyFrames(), CONFIG, **options) as stream:
         found = [next(stream)]
         for process in multiprocessing.active_children():
             os.kill(process.pid, signal.SIGTERM)
@@ -310,32 +306,19 @@ def test_an_unreadable_file_stops_the_run_with_its_message(threads, workers):
         run(Broken(), threads=threads, workers=workers)
 
 
-@pytest.mark.parametrize(
-    ("size", "options", "message"),
-    [
-        (0, {}, "training frames: got none, expected at least one"),
-        (7, {"num_processes": 3}, "process 0 of 3: expected a number that divides the batch of 4"),
-        (7, {"num_processes": 2, "process_index": 2}, "process 2 of 2"),
-        (7, {"num_processes": 0}, "process 0 of 0"),
-        (7, {"first_step": 2}, "first_step: got 2, expected 0 to 1"),
-    ],
-)
-def test_invalid_arguments_are_refused(size, options, message):
-    with refused(message):
-        run(ToyFrames(size), num_steps=1, **options)
-
-
-@pytest.mark.parametrize("name", ["threads", "workers"])
-def test_negative_numbers_of_threads_and_workers_are_refused(name):
-    with refused(f"{name}: got -1, expected at least 0"):
-        check_loader_options(PLAIN, **{"threads": 0, "workers": 0, name: -1})
+def test_no_frames_are_refused():
+    with refused("training frames: got none, expected at least one"):
+        run(ToyFrames(0))
 
 
 ORPHANED = """
-import multiprocessing, os, signal
-from test_loader import PLAIN, STEPS, ToyFrames, make_batches
+import dataclasses, multiprocessing, os, signal
+from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.presets import QUICKSTART
+from toy_frames import ToyFrames
 if __name__ == "__main__":
-    with make_batches(ToyFrames(), PLAIN, seed=0, num_steps=STEPS, workers=2) as batches:
+    config = dataclasses.replace(QUICKSTART, class_balanced=False)
+    with make_batches(ToyFrames(), config, seed=0, num_steps=6, threads=1, workers=1) as batches:
         next(batches)
         print(*[process.pid for process in multiprocessing.active_children()], flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
@@ -349,7 +332,7 @@ def test_workers_end_when_the_main_process_is_killed(tmp_path):
     done = run_python(script)
     assert done.returncode == -signal.SIGKILL
     left = {int(number) for number in done.stdout.split()}
-    assert len(left) >= 2
+    assert left
     deadline = time.monotonic() + 30
     while left and time.monotonic() < deadline:
         left = {number for number in left if Path(f"/proc/{number}").exists()}

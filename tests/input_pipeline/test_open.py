@@ -138,17 +138,6 @@ def test_data_keep_their_units_and_axes_with_another_sensor(roots, capsys):
         assert ahead.azimuth_limits_rad == pytest.approx((np.pi / 4, 3 * np.pi / 4))
 
 
-def test_a_new_format_keeps_the_units_and_axes_of_its_sensor(roots, monkeypatch):
-    own = dataclasses.replace(VLP16, forward_rad=0.5, origin_m=(0.0, 0.0, 1.9), intensity_scale=2.0)
-    readers = tuple(
-        dataclasses.replace(reader, sensor=own) if reader.name == "kitti" else reader for reader in READERS
-    )
-    monkeypatch.setattr("fcos_lidar_jax.input_pipeline.open.READERS", readers)
-    sensor = open_frames(roots["kitti"], sensor=NUSCENES_HDL32E).sensor
-    assert (sensor.forward_rad, sensor.origin_m, sensor.intensity_scale) == (0.5, (0.0, 0.0, 1.9), 2.0)
-    assert sensor.num_columns == NUSCENES_HDL32E.num_columns
-
-
 def test_intensities_are_brought_to_the_scale_of_the_network_by_a_given_factor(roots, tmp_path):
     for format in ("kitti", "argoverse2", "folder"):
         plain, times = open_frames(roots[format]), open_frames(roots[format], intensity_scale=8.0)
@@ -163,15 +152,6 @@ def test_intensities_are_brought_to_the_scale_of_the_network_by_a_given_factor(r
         np.full((4, 5), 9, np.float32).tofile(file.with_suffix(".pcd.bin"))
     with refused(".pcd.bin: intensity scale: got 8, expected none"):
         open_frames(root, intensity_scale=8.0)
-
-
-def test_kitti_is_cropped_to_the_image_unless_the_full_turn_is_wanted(roots):
-    cropped, whole = open_frames(roots["kitti"]), open_frames(roots["kitti"], full_turn=True)
-    raw = np.fromfile(roots["kitti"] / "training" / "velodyne" / "000000.bin", np.float32).reshape(-1, 4)
-    np.testing.assert_array_equal(whole.frame(0).points[:, :3], raw[:, :3])
-    assert (whole.frame(0).points[:, 0] < 0).any()
-    assert (cropped.frame(0).points[:, 0] > 0).all()
-    assert cropped.fingerprint() != whole.fingerprint()
 
 
 def test_a_class_map_renames_and_drops_classes(roots):
@@ -203,32 +183,6 @@ def test_class_maps_cover_all_classes_and_lead_to_classes_of_the_other_data():
     assert not left_out
 
 
-WORDS = {
-    "kitti": {"car": "Car Van", "bus": "Tram", "pedestrian": "Pedestrian Person_sitting", "bicycle": "Cyclist"},
-    "nuscenes": {"Car": "car", "Truck": "truck", "Pedestrian": "pedestrian", "Cyclist": "bicycle"},
-    "argoverse2": {
-        "car": "REGULAR_VEHICLE",
-        "truck": "LARGE_VEHICLE TRUCK BOX_TRUCK TRUCK_CAB",
-        "bus": "BUS SCHOOL_BUS ARTICULATED_BUS",
-        "trailer": "VEHICULAR_TRAILER MESSAGE_BOARD_TRAILER",
-    },
-}
-"""Format -> class of the other data -> its classes."""
-
-
-@pytest.mark.parametrize("format", WORDS)
-def test_a_class_map_can_be_chosen_by_name(roots, format):
-    name = "kitti" if format == "nuscenes" else "nuscenes"
-    plain, mapped = open_frames(roots[format]), open_frames(roots[format], class_map=name)
-    for i in range(len(plain)):
-        own = [plain.classes[label] for label in plain.labels(i)]
-        new = [mapped.classes[label] for label in mapped.labels(i)]
-        for to, of in WORDS[format].items():
-            assert new.count(to) == sum(map(own.count, of.split()))
-    assert set(WORDS[format]) <= set(mapped.classes)
-    assert mapped.labels(0).size > 0
-
-
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_fingerprint_depends_on_files_and_options(roots, tmp_path, format):
     root = shutil.copytree(roots[format], tmp_path / "copy")
@@ -252,17 +206,12 @@ BAD = {
     "gone": ({"root": "gone"}, "gone: no such folder, expected a data set"),
     "format": ({"root": "kitti", "format": "kiti"}, "format: got 'kiti', expected kitti"),
     "version of kitti": ({"root": "kitti", "version": "v1"}, "version: got v1, expected none"),
-    "index of a folder": ({"root": "folder", "index": "x"}, "index: got x, expected none"),
-    "splits of kitti": ({"root": "kitti", "splits": "x"}, "splits: got x, expected none"),
-    "missing sweeps": ({"root": "kitti", "allow_missing_sweeps": True}, "allow_missing_sweeps: got True"),
     "no such version": ({"root": "nuscenes", "version": "v9"}, "v9: no such folder, expected one of v1.0-made"),
     "full turn": ({"root": "argoverse2", "full_turn": True}, "full_turn: got True, expected none"),
-    "scale": ({"root": "nuscenes", "intensity_scale": 2.0}, "intensity_scale: got 2.0, expected none"),
     "no scale": (
         {"root": "folder", "intensity_scale": -2.0},
         "intensity_scale: got -2.0, expected within",
     ),
-    "sweeps": ({"root": "kitti", "num_sweeps": 0}, "num_sweeps: got 0, expected at least 1"),
     "class map": (
         {"root": "kitti", "class_map": {"Lorry": "truck"}},
         "class map: got Lorry, expected classes of the data: Car, Van, ",
@@ -271,8 +220,6 @@ BAD = {
         {"root": "folder", "class_map": "nuscenes"},
         "class map: got 'nuscenes', expected one of the class maps of format folder: (none)",
     ),
-    "map of other data": ({"root": "kitti", "class_map": "kitti"}, "class maps of format kitti: nuscenes"),
-    "other reader": ({"root": "kitti", "format": "folder"}, "found no file, expected a folder of .pcd.bin"),
 }
 
 

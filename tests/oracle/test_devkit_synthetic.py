@@ -72,6 +72,10 @@ def test_boxes_equal_the_devkits(root, official):
         for own, token in zip(boxes.boxes, boxes.tokens, strict=True):
             np.testing.assert_allclose(own[:3], by_token[token].center, atol=1e-4)
             np.testing.assert_allclose(own[[4, 3, 5]], by_token[token].wlh, atol=1e-6)
+            heading = by_token[token].orientation.rotation_matrix[:, 0]
+            assert abs(np.angle(np.exp(1j * (np.arctan2(heading[1], heading[0]) - own[6])))) < 1e-6
+            row = int(np.flatnonzero(data.index.box_token == token.encode())[0])
+            np.testing.assert_allclose(data.index.box_velocity[row], official.box_velocity(token), atol=1e-5)
 
 
 def test_the_devkit_evaluates_on_the_splits_of_its_own_file(root, official, tmp_path):

@@ -53,7 +53,7 @@ class _Tables:
     def find_all(self, numbers: dict[str, int], rows: list[R], field: str, dtype: type) -> np.ndarray:
         return np.array([self.find(numbers, row, field) for row in rows], dtype)
 
-    def check_poses(self, kind: type[Row], tokens: list[str], columns: Columns) -> None:
+    def normalise_poses(self, kind: type[Row], tokens: list[str], columns: Columns) -> None:
         """Refuse invalid poses, and normalise rotations to the last bit."""
         rotation = columns["rotation"]
         check_poses(rotation, columns["translation"], lambda row: self.place(kind, tokens[row]))
@@ -78,8 +78,6 @@ def _floats(rows: list[Any], **widths: int) -> Columns:
 def build_index(folder: str | Path, report: Report = lambda name, rows: None) -> Index:
     """Read, check and join the tables in ``ROOT/VERSION``; ``report`` is called after every piece of a table."""
     tables = _Tables(Path(folder), report)
-    if not tables.folder.is_dir():
-        raise ValueError(f"{folder}: no such folder, expected the tables of a version")
     columns = _keyframes(tables)
     samples = {token.decode(): i for i, token in enumerate(columns["sample_token"])}
     columns |= _sweeps(tables, samples)
@@ -132,7 +130,7 @@ def _sweeps(tables: _Tables, samples: dict[str, int]) -> Columns:
         raise tables.error(kinds.Sample, lost, problem)
     ego = _ego_poses(tables, rows)
     mounted = _floats(mounts, rotation=4, translation=3)
-    tables.check_poses(kinds.CalibratedSensor, list(lidars), mounted)
+    tables.normalise_poses(kinds.CalibratedSensor, list(lidars), mounted)
     return {
         "sample_sweep": own_sweep,
         "sweep_file": np.array([row.filename.encode() for row in rows], np.bytes_),
@@ -164,7 +162,7 @@ def _ego_poses(tables: _Tables, rows: list[kinds.SampleData]) -> Columns:
         if np.isnan(rotation[i, 0]):
             raise tables.error(kinds.SampleData, row.token, _dangling("ego_pose_token", row.ego_pose_token))
     columns = {"rotation": rotation, "translation": translation}
-    tables.check_poses(kinds.EgoPose, list(numbers), columns)
+    tables.normalise_poses(kinds.EgoPose, list(numbers), columns)
     return {name: column[np.array(order, np.int64)] for name, column in columns.items()}
 
 
@@ -202,7 +200,7 @@ def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray)
     for i in np.flatnonzero(~((size <= LIMITS["l"]) & (size > 0)).all(axis=1)):
         problem = f"size: got {size[i].tolist()}, expected three positive lengths of at most {LIMITS['l']:g} m"
         raise tables.error(kinds.SampleAnnotation, tokens[i], problem)
-    tables.check_poses(kinds.SampleAnnotation, tokens, columns)
+    tables.normalise_poses(kinds.SampleAnnotation, tokens, columns)
     neighbours = []
     for field, linked in links.items():
         neighbours.append(np.array([numbers.get(token, _DANGLING) if token else -1 for token in linked], np.int64))

@@ -127,10 +127,8 @@ TABLES: tuple[type[Row], ...] = tuple(Row.__subclasses__())
 def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) -> Iterator[list[R]]:
     """Read the rows of a table in order, in pieces of about ``piece_bytes`` of text."""
     path = folder / kind.file
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file, expected the table")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path}: empty file, expected a JSON list")
+    if not path.is_file() or not path.stat().st_size:
+        raise ValueError(f"{path}: no such file, or an empty one, expected the table")
     decoder = msgspec.json.Decoder[list[R]](GenericAlias(list, kind))
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text:
         num_rows = 0
@@ -156,9 +154,6 @@ def _pieces(text: mmap.mmap, size: int) -> Iterator[tuple[int, int]]:
 def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, first_row: int) -> list:
     try:
         return decoder.decode(piece)
-    except msgspec.ValidationError as error:
-        text, _, place = str(error).rpartition(" - at `")
-        place = re.sub(r"\$\[(\d+)\]", lambda match: f"$[{int(match[1]) + first_row}]", place.rstrip("`"))
-        raise ValueError(f"{path}: {place or '$'}: {text or error}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: from row {first_row} on: not JSON: {error}") from None
+        problem = re.sub(r"\$\[(\d+)\]", lambda match: f"$[{int(match[1]) + first_row}]", str(error))
+        raise ValueError(f"{path}: from row {first_row} on: {problem}") from None
