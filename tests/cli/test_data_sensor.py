@@ -280,6 +280,7 @@ def test_the_sensor_of_own_data_is_used_for_their_files(tmp_path, capsys):
     [
         (1.5708, "note: --yaw-deg 1.5708 is in degrees; are 90 meant?\n"),
         (90.0, ""),
+        (11.0, ""),  # nearly 3.5 pi
         (None, ""),
     ],
 )

@@ -130,14 +130,14 @@ def test_damaged_files_are_refused(home, tmp_path, damage, message):
     [
         (
             "detect HOME/cloud.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos",
-            "inside of the checkpoint",
+            "the place of the checkpoint",
         ),
         (
             "stream HOME/cloud.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos",
-            "inside of the checkpoint",
+            "the place of the checkpoint",
         ),
-        ("benchmark --checkpoint HOME/detector.fcos --out HOME/detector.fcos", "inside of the checkpoint"),
-        ("export --checkpoint HOME/checkpoint --out HOME/checkpoint/a", "inside of the checkpoint"),
+        ("benchmark --checkpoint HOME/detector.fcos --out HOME/detector.fcos", "the place of the checkpoint"),
+        ("export --checkpoint HOME/checkpoint --out HOME/checkpoint/a", "the place of the checkpoint"),
         ("export --checkpoint HOME/checkpoint --out HOME", "found a folder"),
         ("export --checkpoint HOME/detector.fcos --out HOME/a", "found a file, expected a checkpoint folder"),
     ],
