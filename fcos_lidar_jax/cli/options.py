@@ -140,7 +140,8 @@ FullTurn = Annotated[
 
 def radians(degrees: float | None) -> float | None:
     """The angle of ``yaw_deg`` in radians; None stays None."""
-    if 0 < abs(degrees or 0) < 6.3 and abs(degrees - (octants := round(degrees * 4 / math.pi)) * math.pi / 4) < 0.005:
+    octants = round((degrees or 0.0) * 4 / math.pi)
+    if degrees and abs(octants) <= 8 and abs(degrees - octants * math.pi / 4) < 0.005:
         tell(f"note: --yaw-deg {degrees:g} is in degrees; are {45 * octants} meant?", once=True)
     return None if degrees is None else math.radians(degrees)
 
