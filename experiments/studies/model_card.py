@@ -23,6 +23,7 @@ SHIPPED = Path(fcos_lidar_jax.__file__).parent / "weights"
 _BANDS = ("all", "0-20 m", "20-40 m")
 _UNSEEN = {
     "hdl32e": "with class frequencies of cities and half as many objects as in training",
+    "hdl64e": "with class frequencies of cities and half as many objects as in training",
     "quickstart": "of the same kind of streets",
 }
 _AXES = "x right, y forward, z up from the sensor, in metres"
@@ -53,7 +54,8 @@ def write_card(name: str, results: Path, training: Mapping[str, Any] | None = No
         raise ValueError(f"{file}: training: missing, expected the training that shipped_weights --export records")
     if record.get("hash", weights) != weights:
         raise ValueError(f"{file}: hash: got {record['hash']}, expected the hash of the weights: {weights}")
-    lines = [*_about(name, record), *_figures(results / "transfer.json", weights), *_training(name, record)]
+    figures = _figures(record, results / "transfer.json", weights)
+    lines = [*_about(name, record), *figures, *_training(name, record)]
     path = folder / "README.md"
     write_text(path, "\n".join(lines) + "\n")
     return path
@@ -97,10 +99,14 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
 
 
-def _figures(file: Path, weights: str) -> Iterator[str]:
+def _figures(record: Mapping[str, Any], file: Path, weights: str) -> Iterator[str]:
+    if record["name"] == "hdl64e":
+        yield f"Average precision: {', '.join(f'{name} {ap:.3f}' for name, ap in record['AP'].items())}."
+        yield "These weights have not been scored on KITTI's data, nor on any other real sweep."
+        return
+    measured = read_json(file, dict[str, Any]) if file.exists() else {}
     command = "`python -m experiments.studies.transfer --data FOLDER`"
-    record = read_json(file, dict[str, Any]) if file.exists() else {}
-    if record.get("checkpoint", {}).get("hash") != weights:
+    if measured.get("checkpoint", {}).get("hash") != weights:
         yield f"Not measured yet with these weights: run {command}."
         return
     yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, measured by {command}."
@@ -108,10 +114,10 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
     yield "Intervals over keyframes are too narrow, because keyframes of a scene are similar."
     yield "mAP is the mean over the classes that occur: do not compare it between scenes with other classes."
     yield "*Official* scores are the nuScenes benchmark's own."
-    for name, part in record.items():
+    for place, part in measured.items():
         if isinstance(part, dict) and "all" in part:
-            yield from _part(name, part)
-    if found := record.get("fine_tuning"):
+            yield from _part(place, part)
+    if found := measured.get("fine_tuning"):
         starts = {"from the checkpoint": "from these weights", "from scratch": "from random ones"}
         scores = [f"{found[start]['all']['mAP']:.3f} {text}" for start, text in starts.items() if start in found]
         yield f"\n### Fine-tuned on {found['keyframes']} real keyframes, {found['steps']} steps\n"
