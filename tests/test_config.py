@@ -43,6 +43,7 @@ def test_presets_are_the_papers():
     assert (NUSCENES.inference.min_probability, NUSCENES.inference.iou_threshold) == (0.01, 0.2)
     assert (NUSCENES.inference.max_detections, NUSCENES.loss.top_q) == (500, 20)
     assert (NUSCENES.optimizer.epochs, NUSCENES.optimizer.weight_decay) == (40, 0.01)
+    assert (projection.remove_close, projection.close_m) == ("sweeps", 1.0)  # gives the paper's numbers of points
     assert NUSCENES_SINGLE.num_sweeps == 1
     assert NUSCENES_SINGLE.projection == NUSCENES.projection
     assert (NUSCENES_TEST.model.head_channels, NUSCENES_TEST.fade_epochs) == (128, 5)

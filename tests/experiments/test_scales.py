@@ -124,7 +124,7 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(layout, t
 def test_splits_are_opened_before_the_first_cell_is_trained(layout):
     with refused("wrong"):
         dataclasses.replace(layout, val_split="wrong").checked()
-    with refused("--test-version: ", "v9: no such folder"):
+    with refused("--test-version: ", "v9/scene.json: no such file"):
         dataclasses.replace(layout, test_version="v9").checked()
     testing = dataclasses.replace(layout, test_version="v1.0-mini")
     with refused("--test-version: split 'test': not found in "):
