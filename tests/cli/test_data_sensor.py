@@ -278,7 +278,7 @@ def test_the_sensor_of_own_data_is_used_for_their_files(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("degrees", "note"),
     [
-        (1.5708, "note: --yaw-deg 1.5708 is in degrees; are 90 meant?\n"),
+        (1.57, "note: --yaw-deg 1.57 is in degrees; are 90 meant?\n"),
         (90.0, ""),
         (11.0, ""),  # nearly 3.5 pi
         (None, ""),

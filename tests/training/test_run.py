@@ -33,6 +33,7 @@ from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.input_pipeline import loader
+from fcos_lidar_jax.input_pipeline.database import prepare_database
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.training import plan
 from fcos_lidar_jax.training import run as runs
@@ -413,7 +414,6 @@ def test_a_checkpoint_without_a_mean_ap_is_saved_without_a_score(tmp_path, capsy
         ("config.loss.l1_weight", 9.0, "0.25"),
         ("config.model.remat", None, "False"),
         ("steps", 5, "4"),
-        ("ground_truth_database", "x", "None"),
         ("data", "other frames", ""),
     ],
 )
@@ -431,6 +431,17 @@ def test_a_different_specification_is_refused_and_the_field_named(begun, field, 
     ):
         train_tiny(begun, resume=True)
     assert [path.name for path in begun.iterdir()] == ["run.json"]
+
+
+def test_a_different_ground_truth_database_of_the_same_frames_is_refused(begun, tmp_path):
+    config = dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())
+    first, other = (prepare_database(FRAMES, tmp_path / str(n), min_points=n) for n in (6, 5))
+    spec = json.loads((begun / "run.json").read_text()) | {"objects": first.manifest.source}
+    spec |= {"config": plan.recorded_config(config, FRAMES), "ground_truth_database": first.fingerprint()}
+    (begun / "run.json").write_text(json.dumps(spec))
+    message = f"ground_truth_database: was '{first.fingerprint()}', got '{other.fingerprint()}': only the same run"
+    with pytest.raises(ValueError, match=message):
+        train_tiny(begun, resume=True, config=config, objects=other)
 
 
 LOST = "checkpoints: found none, but metrics of 4 steps, and this schedule saves step"
