@@ -27,8 +27,8 @@ class Bounds:
         low = all(number > self.low or (number == self.low and not self.above) for number in numbers)
         closed = not self.below and self.high < math.inf
         high = all(number < self.high or (number == self.high and closed) for number in numbers)
-        sorted_ = not self.ascending or all(a <= b for a, b in itertools.pairwise(numbers))
-        return low and high and sorted_ and (self.empty or len(numbers) > 0)
+        in_order = not self.ascending or all(a <= b for a, b in itertools.pairwise(numbers))
+        return low and high and in_order and (self.empty or len(numbers) > 0)
 
     def __str__(self) -> str:
         if self.ascending:

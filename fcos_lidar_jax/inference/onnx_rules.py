@@ -167,7 +167,8 @@ def _dynamic_slice(graph: Graph, eqn: Any, x: Value, *starts: Value) -> Value:
 @_rule("pad")
 def _pad(graph: Graph, eqn: Any, x: Value, value: Value) -> Value:
     low, high, interior = zip(*eqn.params["padding_config"], strict=True)
-    assert not any(interior), "a pad between elements"
+    if any(interior):
+        raise NotImplementedError("found a pad between elements, which has no rule")
     return graph("Pad", x, _ints([*low, *high]), value)
 
 
@@ -206,8 +207,8 @@ def _gather(graph: Graph, eqn: Any, x: Value, indices: Value) -> Value:
     order = [*axes, *(i for i in range(len(shape)) if i not in axes)]
     x = _permuted(graph, x, order)
     sizes = [shape[axis] for axis in order]
-    windows = [eqn.params["slice_sizes"][axis] for axis in order]
-    assert windows == [1] * len(axes) + sizes[len(axes) :], "a gather of windows"
+    if [eqn.params["slice_sizes"][axis] for axis in order] != [1] * len(axes) + sizes[len(axes) :]:
+        raise NotImplementedError("found a gather of windows, which has no rule")
     for axis in dims.start_indices_batching_dims:
         along = [count[axis] if i == axis else 1 for i in range(len(count))]
         own = graph("Expand", np.arange(count[axis]).reshape(along), _ints([*count[:-1], 1]))
@@ -232,8 +233,8 @@ def _scatter(graph: Graph, eqn: Any, x: Value, indices: Value, updates: Value) -
     order = [*axes, *(i for i in range(len(shape)) if i not in axes)]
     x = _permuted(graph, x, order)
     rest = [shape[axis] for axis in order[len(axes) :]]
-    whole = {*axes} == {*dims.inserted_window_dims} and [sizes[axis] for axis in windows] == rest
-    assert whole, "a scatter of windows"
+    if {*axes} != {*dims.inserted_window_dims} or [sizes[axis] for axis in windows] != rest:
+        raise NotImplementedError("found a scatter of windows, which has no rule")
     number, width = math.prod(shape[axis] for axis in axes), math.prod(rest)
     # Updates outside of the array go to an additional row.
     place, _ = _places(graph, indices, [shape[axis] for axis in axes], number)
@@ -253,7 +254,8 @@ def _scatter(graph: Graph, eqn: Any, x: Value, indices: Value, updates: Value) -
 def _scan(graph: Graph, eqn: Any, *inputs: Value) -> list[Value]:
     """Steps one after the other, as in a binary search."""
     fixed, number = eqn.params["num_consts"], eqn.params["num_carry"]
-    assert len(inputs) == fixed + number and len(eqn.outvars) == number, "a scan over arrays"  # noqa: PT018
+    if len(inputs) != fixed + number or len(eqn.outvars) != number:
+        raise NotImplementedError("found a scan over arrays, which has no rule")
     state = [*inputs[fixed:]]
     for _ in range(eqn.params["length"]):
         state = translate(graph, eqn.params["jaxpr"], [*inputs[:fixed], *state])

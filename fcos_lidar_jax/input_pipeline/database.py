@@ -182,11 +182,12 @@ def prepare_database(
             shard.
 
     Raises:
-        ValueError: missing files, before a frame is read; a frame has an implausible box; no frame has usable
-            points.
+        ValueError: more sweeps than :data:`MAX_SWEEPS`, or missing files, before a frame is read; a frame has an
+            implausible box; no frame has usable points.
         OSError: an error of the file system, or a worker died.
     """
     folder = Path(folder)
+    check(1 <= num_sweeps <= MAX_SWEEPS, "num_sweeps", num_sweeps, f"1 to {MAX_SWEEPS}")
     frames.check_files(range(len(frames)))
     shards, source, columns = shards_by_scene(frames), frames.fingerprint(), frames.sensor.point_columns
     folder.mkdir(parents=True, exist_ok=True)
@@ -211,8 +212,8 @@ def prepare_database(
     tables = {name: _read_shard(folder, name, columns) for name in shards}
     _tell_found(tables, len(frames), min_points)
     entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
-    sweeps, classes = min(num_sweeps, MAX_SWEEPS), list(frames.classes)
-    manifest = Manifest(_FORMAT, _VERSION, source, classes, min_points, sweeps, columns, entries)
+    classes = list(frames.classes)
+    manifest = Manifest(_FORMAT, _VERSION, source, classes, min_points, num_sweeps, columns, entries)
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
     atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
     return open_database(folder, fingerprint=source)

@@ -227,11 +227,8 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     if not file.is_file():
         if resume:
             raise ValueError(f"{file}: found nothing, expected the run to resume")
-        results = [
-            *Checkpoints(folder / CHECKPOINTS).paths(),
-            *folder.glob(METRICS),
-        ]  # a new run would remove them
-        if results:
+        # A new run would remove them.
+        if results := [*Checkpoints(folder / CHECKPOINTS).paths(), *folder.glob(METRICS)]:
             raise ValueError(f"{results[-1]}: found without {RUN_SPEC}, expected another folder")
         return
     if not resume:

@@ -11,7 +11,8 @@ import pytest
 from commands import assert_one_line_error, command, run_python
 from linear_network import linear_network
 from refusal import refused
-from tiny_run import CONFIG, REFINED, SENSOR, bits, untrained
+from tiny_run import REFINED as CONFIG
+from tiny_run import SENSOR, bits, untrained
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
@@ -153,8 +154,8 @@ def linear(tmp_path_factory):
     """A detector with a network of one layer and a second look, and its export for any points and clouds."""
     folder = tmp_path_factory.mktemp("linear")
     with linear_network():
-        detector = TrainedDetector(build_detector(REFINED, SENSOR), untrained(REFINED, SENSOR))
-        save_checkpoint(folder / "checkpoint", Checkpoint(REFINED, SENSOR, detector.variables, 7))
+        detector = TrainedDetector(build_detector(CONFIG, SENSOR), untrained(CONFIG, SENSOR))
+        save_checkpoint(folder / "checkpoint", Checkpoint(CONFIG, SENSOR, detector.variables, 7))
         line = "export --points any --batch any --checkpoint", folder / "checkpoint", "--out", folder / "any.fcos"
         command(*line)
     return detector, folder / "any.fcos"

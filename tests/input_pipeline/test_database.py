@@ -135,6 +135,12 @@ def test_the_fingerprint_depends_on_the_objects_only(tmp_path):
     assert build(tmp_path / "c", min_points=6).fingerprint() != first.fingerprint()
 
 
+def test_more_sweeps_than_are_counted_are_refused_before_the_build(tmp_path):
+    with pytest.raises(ValueError, match=r"^num_sweeps: got 21, expected 1 to 20$"):
+        prepare_database(ToyFrames(), tmp_path, num_sweeps=21)
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_implausible_box_is_refused(tmp_path):
     frame = toy_frame(0)
     frame.boxes[3, 4] = 0

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 import re
 
 import jax
@@ -33,8 +34,11 @@ def forward_and_backward(**model):
 
 @pytest.mark.slow
 def test_remat_changes_what_is_kept_for_the_backward_pass_and_nothing_else():
-    """Rounding may differ, which depends on the number of cores; half as much is kept."""
+    """Outputs and statistics are equal to the bit, gradients up to rounding; half as much is kept."""
     (plain, kept), (remat, kept_less) = forward_and_backward(), forward_and_backward(remat=True)
+    if len(os.sched_getaffinity(0)) > 1:  # On one core, XLA rounds the two programs differently.
+        for name in ("outputs", "statistics"):
+            jax.tree.map(np.testing.assert_array_equal, plain[name], remat[name])
     assert jax.tree.structure(plain) == jax.tree.structure(remat)
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(remat), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(a).max())
