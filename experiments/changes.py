@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.config import Config, RefinementConfig
 from fcos_lidar_jax.presets import COMPACT
 
 Change = Callable[[Config], Config]
@@ -50,3 +50,5 @@ LARGER = {
     },
 }
 """Fields that return to the sizes of ``compact`` today."""
+QUARTER_LOOK = RefinementConfig(num_boxes=64)
+"""The second look of ``compact`` for as many boxes as a quarter of the view has."""

@@ -186,9 +186,16 @@ def claims() -> Iterator[Claim]:
             reference, paper = table.reference_of(row), table.paper_difference(row)
             if row is not reference and paper:
                 yield Claim(f"{table.name}: {row.label} instead of {reference.label}", row, reference, paper)
-    for sizes, ablations in (("small", mrv_ablations.SMALL), ("compact", mrv_ablations.TABLE)):
+    tables = {
+        "small": mrv_ablations.SMALL,
+        "small, second look": mrv_ablations.SMALL_LOOKED_AGAIN,
+        "compact": mrv_ablations.TABLE,
+    }
+    for sizes, ablations in tables.items():
         rows = {row.label: row for row in ablations.rows}
         for (label, reference), (name, *pair_of_paper) in LOCAL_GEOMETRY.items():
+            if label not in rows:
+                continue
             theirs, base = (PAPER["tables"][name]["rows"][key] for key in pair_of_paper)
             full = label if reference != "without priority" else "with priority"
             text = f"local geometry, {sizes}: {full} instead of {reference}"

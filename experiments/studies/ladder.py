@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from experiments.cached import CachedFrames
-from experiments.changes import LARGER, SLIM, Change, change
+from experiments.changes import LARGER, QUARTER_LOOK, SLIM, Change, change
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
@@ -40,7 +40,7 @@ from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
+from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.files import checksum, read_json
@@ -76,9 +76,8 @@ BASE: Change = change(
 MARKED = "second round marks objects"
 AFTERWARDS = {"larger, looked at again": "larger", "CenterPoint, looked at again": "CenterPoint"}
 """Trials of a second look, and the trials whose weights it gets, frozen."""
-_LOOK = RefinementConfig(num_boxes=64)  # As many as a quarter of the view has.
 _FROZEN = change(
-    refinement=dataclasses.replace(_LOOK, freeze_detector=True),
+    refinement=dataclasses.replace(QUARTER_LOOK, freeze_detector=True),
     optimizer__peak_learning_rate=2e-3,
     optimizer__max_gradient_norm=5.0,
 )
@@ -90,8 +89,8 @@ TRIALS: dict[str, Change] = {
     "larger": change(**LARGER),
     "larger, without local geometry": change(**LARGER, model__local_geometry=False),
     MARKED: change(**LARGER, projection__num_rounds=2),
-    "local geometry, joint": change(refinement=_LOOK),
-    "larger, joint": change(**LARGER, refinement=_LOOK),
+    "local geometry, joint": change(refinement=QUARTER_LOOK),
+    "larger, joint": change(**LARGER, refinement=QUARTER_LOOK),
 }
 TRIALS |= {name: lambda config, first=first: _FROZEN(TRIALS[first](config)) for name, first in AFTERWARDS.items()}
 

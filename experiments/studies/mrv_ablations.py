@@ -3,6 +3,7 @@
     python -m experiments.studies.mrv_ablations  # smoke: minutes, a toy
     python -m experiments.studies.mrv_ablations --scale sector --seeds 0 1 2
     python -m experiments.studies.mrv_ablations --scale sector --seeds 0 1 2 --small  # for CPUs
+    python -m experiments.studies.mrv_ablations --scale sector --seeds 0 1 2 --small --second-look
 
 Tables 1, 2 and 7 compare networks of the scale ``sector``, which are small and have no local geometry, after 8,000
 samples: their curves end where learning begins. These rows have the local geometry and the sizes of ``compact``,
@@ -10,7 +11,8 @@ and see 16,000 samples in batches of four, with a higher learning rate. The firs
 with priority. Four rows have fewer rounds, fewer sweeps or no priority, and one row has no local geometry. The
 paper's figures for one round, one sweep and no priority are -2.06, -3.66 and -2.79 points of mAP. Round offsets
 are the offsets between the points of each pixel's rounds: without them, the heads see the local geometry of the
-first round only.
+first round only. With ``--second-look``, the first five rows have the second look of ``compact``, trained in the
+same step; it sees the points of all sweeps, also those that no round shows.
 
 Processes with the same folders share the cells; one of them can have ``--simulators 12`` on a machine with many
 cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and 3.5 minutes per cell with two processes side
@@ -21,7 +23,7 @@ by side; six fit its memory. On a CPU core, several hours per cell; with ``--sma
 import dataclasses
 from typing import Any
 
-from experiments.changes import LARGER, change
+from experiments.changes import LARGER, QUARTER_LOOK, change
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
 from fcos_lidar_jax.config import Config
@@ -40,13 +42,15 @@ class AblationArgs(Args):
     """Options of the table."""
 
     small: bool = False  # Keep the sizes, batches and epochs of the scale.
+    second_look: bool = False  # Detectors with a second look; without the last two rows.
 
 
-def make_table(*, small: bool) -> Table:
-    """Create the table; its files are named after the sizes."""
+def make_table(*, small: bool, second_look: bool = False) -> Table:
+    """Create the table; its files are named after the sizes and the second look."""
+    refinement = QUARTER_LOOK if second_look else None
 
     def row(label: str, local_geometry: bool = True, **fields: Any) -> Row:
-        own = change(model__local_geometry=local_geometry, **fields)
+        own = change(model__local_geometry=local_geometry, refinement=refinement, **fields)
 
         def apply(config: Config) -> Config:
             return own(_GROWN(config) if config.name == "sector" and not small else config)
@@ -59,19 +63,22 @@ def make_table(*, small: bool) -> Table:
         row("without priority", projection__prioritize_current=False),
         row("five rounds of one sweep", num_sweeps=1),
         row("one round of one sweep", num_sweeps=1, projection__num_rounds=1),
-        row("five rounds of ten sweeps with round offsets", model__round_offsets=True),
-        row("without local geometry", local_geometry=False),
     )
-    title = "Rounds, sweeps and priority, with local geometry" + ", small networks" * small
-    return Table("mrv_ablations" + "_small" * small, title, rows, reference=rows[0].label)
+    if not second_look:
+        offsets = row("five rounds of ten sweeps with round offsets", model__round_offsets=True)
+        rows = (*rows, offsets, row("without local geometry", local_geometry=False))
+    name = "mrv_ablations" + "_small" * small + "_second_look" * second_look
+    parts = "local geometry" + " and a second look" * second_look + ", small networks" * small
+    return Table(name, f"Rounds, sweeps and priority, with {parts}", rows, reference=rows[0].label)
 
 
 TABLE, SMALL = make_table(small=False), make_table(small=True)
+SMALL_LOOKED_AGAIN = make_table(small=True, second_look=True)
 
 
 def main(args: AblationArgs) -> None:
     """Train and print the table."""
-    run_table(SMALL if args.small else TABLE, args)
+    run_table(make_table(small=args.small, second_look=args.second_look), args)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from fcos_lidar_jax.geometry import atan2, safe_norm
 from fcos_lidar_jax.initialization import kernel_init
 from fcos_lidar_jax.refinement.types import Crops
 
-RESIDUAL = 8  # Numbers of a residual, see ``targets.encode_residual``.
 _FINE_M = 0.2  # Distance from the centre up to which asinh resolves positions finely.
 _FULL = lax.Precision.HIGHEST  # Positions would be rounded to TF32 or bfloat16 otherwise.
 
@@ -34,8 +33,13 @@ def box_features(
     labels: Int32[Array, "m"],
     count: Int32[Array, "m"],
     num_classes: int,
+    *,
+    with_velocity: bool = False,
 ) -> Float32[Array, "m f"]:
-    """Features of the boxes: class, logit of the score, log sizes, range, number of points, turn from the ray."""
+    """Features of the boxes: class, logit of the score, log sizes, range, number of points, turn from the ray.
+
+    With ``with_velocity`` (static) also the velocity along the heading and to the left.
+    """
     score = jnp.clip(scores, 1e-4, 1 - 1e-4)
     turn = boxes[..., 6] - atan2(boxes[..., 1], boxes[..., 0])
     columns = [
@@ -46,23 +50,27 @@ def box_features(
         jnp.sin(turn),
         jnp.cos(turn),
     ]
+    if with_velocity:
+        cos, sin, vx, vy = jnp.cos(boxes[..., 6]), jnp.sin(boxes[..., 6]), boxes[..., 7], boxes[..., 8]
+        columns += [(cos * vx + sin * vy) / 10, (cos * vy - sin * vx) / 10]
     return jnp.concatenate([jax.nn.one_hot(labels, num_classes), jnp.stack(columns, axis=-1)], axis=-1)
 
 
 class SecondLook(nn.Module):
     """Layers on each point, the maximum over the points of a box, and layers on each box.
 
-    Returns class logits [..., k + 1], with the background last, and residuals [..., 8].
+    Returns class logits [..., k + 1], with the background last, and residuals [..., r].
     """
 
     num_classes: int
+    residual_size: int  # Numbers of a residual, see ``targets.encode_residual``.
     point_channels: tuple[int, ...]
     box_channels: tuple[int, ...]
 
     @nn.compact
     def __call__(
         self, inputs: tuple[Array, Array, Array], *, train: bool = False
-    ) -> tuple[Float32[Array, "*b k"], Float32[Array, "*b 8"]]:
+    ) -> tuple[Float32[Array, "*b k"], Float32[Array, "*b r"]]:
         x, valid, boxes = inputs
         for layer, width in enumerate(self.point_channels):
             x = nn.Dense(width, kernel_init=_he, precision=_FULL, name=f"point{layer}")(x)
@@ -71,7 +79,7 @@ class SecondLook(nn.Module):
         x = jnp.concatenate([jnp.where(valid[..., None], x, 0.0).max(axis=-2), boxes], axis=-1)
         for layer, width in enumerate(self.box_channels):
             x = jax.nn.relu(nn.Dense(width, kernel_init=_he, name=f"box{layer}")(x))
-        x = nn.Dense(self.num_classes + 1 + RESIDUAL, kernel_init=_small, name="out")(x)
+        x = nn.Dense(self.num_classes + 1 + self.residual_size, kernel_init=_small, name="out")(x)
         logits, residual = jnp.split(x, [self.num_classes + 1], axis=-1)
         return logits, residual.at[..., -1].add(1.0)  # Zero outputs leave a box as it is.
 

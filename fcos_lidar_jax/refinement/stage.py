@@ -75,8 +75,13 @@ def without_second_look(variables: dict[str, Any]) -> dict[str, Any]:
 
 def make_network(config: Config) -> SecondLook:
     """The network of a configuration with a second look."""
-    refinement = _config_of(config)
-    return SecondLook(len(config.classes), refinement.point_channels, refinement.box_channels)
+    refinement, size = _config_of(config), 10 if _sees_motion(config) else 8
+    return SecondLook(len(config.classes), size, refinement.point_channels, refinement.box_channels)
+
+
+def _sees_motion(config: Config) -> bool:
+    """Whether points of several sweeps show velocities, which the second look then corrects too."""
+    return config.num_sweeps > 1
 
 
 def trainable(params: dict[str, Any], config: Config) -> dict[str, Any]:
@@ -113,7 +118,9 @@ def look_inputs(config: Config, points: Array, valid: Array, boxes: Boxes) -> tu
     refinement = _config_of(config)
     place, scores, labels, _ = boxes
     crops = crop_points(points, valid, place, num_points=refinement.num_points, margin_m=refinement.margin_m)
-    of_boxes = box_features(place, scores, labels, crops.count, len(config.classes))
+    of_boxes = box_features(
+        place, scores, labels, crops.count, len(config.classes), with_velocity=_sees_motion(config)
+    )
     return point_features(crops, place), crops.valid, of_boxes
 
 
@@ -153,7 +160,7 @@ def refinement_sums(detector: "Detector", variables: Any, outputs: Any, inputs: 
     """The losses of the second look on the detector's own boxes, which have no gradient, as sums over the batch.
 
     ``refined_class`` is the cross-entropy of all boxes, ``refined_box`` the L1 distance of the residuals of boxes
-    near an object.
+    near an object, with ``loss.velocity_weight``.
     """
     with jax.named_scope("refine"):
         return look_sums(detector.config, variables, *look_samples(detector, outputs, inputs, batch))
@@ -179,6 +186,7 @@ def look_samples(
             num_classes=len(config.classes),
             radius_range_m=refinement.radius_range_m,
             between_weight=refinement.between_weight,
+            with_velocity=_sees_motion(config),
         )
         return look_inputs(config, one.points, one.valid, boxes), targets
 
@@ -191,7 +199,11 @@ def look_sums(
     """The losses of the second look on boxes of several clouds, from the results of :func:`look_samples`."""
     logits, residual = look(make_network(config), variables, looked)
     entropy = jax.vmap(cross_entropy)(logits, targets.label)
-    distance = jnp.abs(residual - targets.residual).sum(axis=-1)
+    known = ~jnp.isnan(targets.residual)
+    distance = jnp.abs(jnp.where(known, residual - jnp.where(known, targets.residual, 0.0), 0.0))
+    if _sees_motion(config):
+        distance *= jnp.array([*[1.0] * 6, *[config.loss.velocity_weight] * 2, 1.0, 1.0])
+    distance = distance.sum(axis=-1)
     used = targets.weight > 0
     right = (logits.argmax(axis=-1) == targets.label) & used
     losses = {

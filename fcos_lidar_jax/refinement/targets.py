@@ -22,6 +22,7 @@ def match_boxes(
     num_classes: int,
     radius_range_m: tuple[float, float],
     between_weight: float = 0.3,
+    with_velocity: bool = False,
 ) -> RefinementTargets:
     """Find the box that stands for each object: the nearest of its class, or else the nearest of any class.
 
@@ -35,6 +36,7 @@ def match_boxes(
         num_classes: number of classes, which is also the label of the background (static).
         radius_range_m: limits of the radius (static).
         between_weight: weight of boxes between one and two radii, which are neither right nor wrong (static).
+        with_velocity: the residual includes the velocity (static); NaN where that of the object is unknown.
 
     >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0.0], [0.3, 0, 0, 4, 2, 1, 0], [9, 0, 0, 4, 2, 1, 0]])
     >>> car, yes = jnp.zeros(1, int), jnp.ones(1, bool)
@@ -65,7 +67,8 @@ def match_boxes(
     between = ~box_near & (pair & (distance < 2 * radius)).any(axis=1)
     weight = jnp.where(between, between_weight, 1.0) * jnp.asarray(valid)
     # Boxes without an object get themselves as a harmless object.
-    target = jnp.where(box_near[:, None], true_boxes[owner][:, :7], boxes[:, :7])
+    columns = 9 if with_velocity else 7
+    target = jnp.where(box_near[:, None], true_boxes[owner][:, :columns], boxes[:, :columns])
     residual = jnp.where(box_near[:, None], encode_residual(boxes, target), 0.0)
     return RefinementTargets(label, residual, box_near, weight.astype(jnp.float32))
 
@@ -77,11 +80,12 @@ def _first_of_all(cost: Array) -> tuple[Array, Array]:
     return cost.argmin(axis=0), cost.min(axis=0) < _FAR_M
 
 
-def encode_residual(boxes: Float32[Array, "m c"], targets: Float32[Array, "m k"]) -> Float32[Array, "m 8"]:
+def encode_residual(boxes: Float32[Array, "m c"], targets: Float32[Array, "m k"]) -> Float32[Array, "m r"]:
     """Residual from boxes to targets, in the frame of each box.
 
     Offset of the centre along the heading, to the left and upwards (metres), log ratios of length, width and
-    height, sine and cosine of the turn. The residual of a box to itself is zero but for the cosine.
+    height, change of the velocity along the heading and to the left (m/s) if the targets have nine columns, sine
+    and cosine of the turn. The residual of a box to itself is zero but for the cosine.
 
     >>> box = jnp.array([[0, 0, 0, 4, 2, 1, jnp.pi / 2]])
     >>> encode_residual(box, box.at[0, 1].set(3.0))[0].round().tolist()
@@ -92,11 +96,15 @@ def encode_residual(boxes: Float32[Array, "m c"], targets: Float32[Array, "m k"]
     size = jnp.log(jnp.maximum(targets[:, 3:6], _MIN_SIZE_M) / jnp.maximum(boxes[:, 3:6], _MIN_SIZE_M))
     turn = targets[:, 6] - boxes[:, 6]
     place = jnp.stack([cos * dx + sin * dy, cos * dy - sin * dx, dz], axis=1)
-    return jnp.concatenate([place, size, jnp.sin(turn)[:, None], jnp.cos(turn)[:, None]], axis=1)
+    parts = [place, size]
+    if targets.shape[1] > 7:
+        vx, vy = (targets[:, i] - boxes[:, i] for i in (7, 8))
+        parts.append(jnp.stack([cos * vx + sin * vy, cos * vy - sin * vx], axis=1))
+    return jnp.concatenate([*parts, jnp.sin(turn)[:, None], jnp.cos(turn)[:, None]], axis=1)
 
 
-def move_boxes(boxes: Float32[Array, "m c"], residual: Float32[Array, "m 8"]) -> Float32[Array, "m c"]:
-    """Inverse of :func:`encode_residual`, with the columns after the seventh unchanged.
+def move_boxes(boxes: Float32[Array, "m c"], residual: Float32[Array, "m r"]) -> Float32[Array, "m c"]:
+    """Inverse of :func:`encode_residual`; the velocity is unchanged if the residual has none.
 
     Sizes change by at most a factor of e.
 
@@ -109,5 +117,9 @@ def move_boxes(boxes: Float32[Array, "m c"], residual: Float32[Array, "m 8"]) ->
     along, left, up = (residual[:, i] for i in range(3))
     place = boxes[:, :3] + jnp.stack([cos * along - sin * left, sin * along + cos * left, up], axis=1)
     size = boxes[:, 3:6] * jnp.exp(jnp.clip(residual[:, 3:6], -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
-    yaw = wrap_angle(boxes[:, 6] + atan2(residual[:, 6], residual[:, 7]))
-    return jnp.concatenate([place, size, yaw[:, None], boxes[:, 7:]], axis=1)
+    yaw = wrap_angle(boxes[:, 6] + atan2(residual[:, -2], residual[:, -1]))
+    velocity = boxes[:, 7:]
+    if residual.shape[1] > 8:
+        along, left = residual[:, 6], residual[:, 7]
+        velocity += jnp.stack([cos * along - sin * left, sin * along + cos * left], axis=1)
+    return jnp.concatenate([place, size, yaw[:, None], velocity], axis=1)

@@ -29,7 +29,8 @@ class RefinementTargets:
     """Targets of the boxes of one cloud."""
 
     label: Int32[Array, "*b m"]  # Class of the object that the box stands for, the number of classes for none.
-    residual: Float32[Array, "*b m 8"]
-    """Residual to the object, see :func:`~fcos_lidar_jax.refinement.targets.encode_residual`; zero unless near."""
+    residual: Float32[Array, "*b m r"]
+    """Residual to the object, see :func:`~fcos_lidar_jax.refinement.targets.encode_residual`; zero unless near.
+    NaN velocity where unknown."""
     near: Bool[Array, "*b m"]  # Whether the centre of the object is within its radius.
     weight: Float32[Array, "*b m"]  # Weight of the classification; zero where the box is invalid.

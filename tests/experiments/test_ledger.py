@@ -88,7 +88,7 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
     for name, score in scores.items():
         changes = ", ".join(sorted(filter(None, ["model.local_geometry=true", *name.split(", ")])))
         cells[changes, 0] = {"scores": {"mAP": score}}
-    found: dict[str, dict] = {"small": {}, "compact": {}}
+    found: dict[str, dict] = {"small": {}, "second look": {}, "compact": {}}
     for text, claim in CLAIMS.items():
         if "local geometry" in text:
             size, _, text = text.rpartition(", ")[2].partition(": ")
@@ -105,3 +105,5 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
         "with priority instead of without priority": ([-10], 2.79),
     }
     assert found["compact"] == {text: ([], paper) for text, (_, paper) in found["small"].items()}
+    assert found["second look"].items() <= found["compact"].items()
+    assert len(found["second look"]) == 6

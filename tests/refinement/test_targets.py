@@ -11,7 +11,7 @@ import pytest
 from fcos_lidar_jax.refinement.targets import encode_residual, match_boxes, move_boxes
 
 OPTIONS = {"num_classes": 3, "radius_range_m": (1.0, 2.0), "between_weight": 0.25}
-match = jax.jit(match_boxes, static_argnames=tuple(OPTIONS))
+match = jax.jit(match_boxes, static_argnames=(*OPTIONS, "with_velocity"))
 
 
 def scene(seed: int):
@@ -41,10 +41,16 @@ def expected(boxes, labels, valid, truth, true_labels, true_valid):
     return label, owner, weight
 
 
+@pytest.mark.parametrize("with_velocity", [False, True])
 @pytest.mark.parametrize("seed", range(5))
-def test_targets_equal_a_loop(seed):
-    arrays = scene(seed)
-    targets = jax.device_get(match(*arrays, **OPTIONS))
+def test_targets_equal_a_loop(seed, with_velocity):
+    arrays = list(scene(seed))
+    if with_velocity:
+        rng = np.random.default_rng(seed)
+        velocities = {i: rng.normal(0, 9, (len(arrays[i]), 2)).astype(np.float32) for i in (0, 3)}
+        velocities[3][::3] = np.nan  # unknown
+        arrays = [np.hstack([a, velocities[i]]) if i in velocities else a for i, a in enumerate(arrays)]
+    targets = jax.device_get(match(*arrays, **OPTIONS, with_velocity=with_velocity))
     label, owner, weight = expected(*arrays)
     np.testing.assert_array_equal(targets.label, label)
     np.testing.assert_array_equal(targets.near, owner >= 0)
@@ -54,6 +60,8 @@ def test_targets_equal_a_loop(seed):
     own = truth[owner[owner >= 0]]
     np.testing.assert_allclose(moved[:, :3], own[:, :3], atol=1e-4)
     np.testing.assert_allclose(np.cos(moved[:, 6] - own[:, 6]), 1, atol=1e-5)
+    np.testing.assert_allclose(moved[:, 7:], own[:, 7:], atol=1e-4)
+    assert np.isnan(targets.residual).any() == with_velocity
     assert not targets.residual[owner < 0].any()
     assert (label < 3).sum() > 3
     assert 0.25 in weight
@@ -82,8 +90,11 @@ def test_residuals_are_coded_in_the_frame_of_the_box():
     target = np.array([[2.0, 6, 5.5, 8, 2, 0.5, np.pi, 0, 0]], np.float32)
     box, target = map(jnp.asarray, (box, target))
     residual = encode_residual(box, target)
-    np.testing.assert_allclose(residual, [[2, 1, 0.5, np.log(2), 0, -np.log(2), 1, 0]], atol=1e-6)
-    np.testing.assert_allclose(move_boxes(box, residual)[0, 7:], [7, 8])
+    place_and_size = [2, 1, 0.5, np.log(2), 0, -np.log(2)]
+    np.testing.assert_allclose(residual, [[*place_and_size, -8, 7, 1, 0]], atol=1e-6)
+    still = encode_residual(box, target[:, :7])  # without velocities
+    np.testing.assert_allclose(still, [[*place_and_size, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(move_boxes(box, still)[0, 7:], [7, 8])
     # Sizes change by at most a factor of e.
     np.testing.assert_allclose(move_boxes(box, residual.at[0, 3].set(5.0))[0, 3], 4 * np.e, rtol=1e-6)
 
@@ -95,4 +106,5 @@ def test_gradients_are_finite_for_degenerate_boxes():
         return encode_residual(a, b).sum() + move_boxes(a, residual).sum() + matched.sum()
 
     boxes, gradient = jnp.zeros((3, 9)), jax.jit(jax.grad(total, argnums=(0, 1, 2)))
-    assert all(np.isfinite(g).all() for g in gradient(boxes, boxes, jnp.zeros((3, 8))))
+    for size in (8, 10):
+        assert all(np.isfinite(g).all() for g in gradient(boxes, boxes, jnp.zeros((3, size))))
