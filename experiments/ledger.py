@@ -4,9 +4,9 @@
     python -m experiments.ledger --write  # also write it into experiments/README.md
 
 The ledger reads our figures from ``experiments/results``, without training or timing. A claim about accuracy is a
-row of a table of the paper. The claims about rounds, sweeps and priority appear twice more, for networks with
-local geometry, which the paper does not have: small networks, and larger ones trained longer in batches of four.
-The verdict follows from the 95 % interval of the gain over the seeds:
+gain of one row of a table of the paper over another. It is asked of small networks that are like the paper's, of
+the same networks with local geometry, and of those with a second look too, which the paper does not have. The
+verdict follows from the 95 % interval of the gain over the seeds:
 
 - excludes zero, with the paper's sign: agrees; agrees only in direction if it also excludes the paper's figure
 - excludes zero, with the other sign: disagrees
@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.benchmarks.latency import PAPER_STAGES
+from experiments.changes import QUARTER_LOOK, Change, change
 from experiments.paper import PAPER
-from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cells import Cell, changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
-from experiments.paper_tables.tables import SCORES, Row
+from experiments.paper_tables.tables import SCORES
 from experiments.script import run_script, write_text
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
-from experiments.studies import mrv_ablations
 from fcos_lidar_jax.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
@@ -106,26 +105,32 @@ FIGURES = [
 
 
 class Claim(NamedTuple):
-    """A claim about accuracy: what a row gains over its reference."""
+    """A claim about accuracy: what a change of the base gains over another change."""
 
     text: str
-    row: Row
-    reference: Row
-    paper: dict[str, float]  # Score -> gain in the paper.
+    change: Change
+    reference: Change
+    paper: tuple[str, str, str]  # Table of the paper, its row and the row's reference.
 
 
-_WITH_OFFSETS = "five rounds of ten sweeps with round offsets"
-LOCAL_GEOMETRY = {
-    ("five rounds of one sweep", "one round of one sweep"): ("table1", "single, 5", "single, 1"),
-    ("five rounds of ten sweeps", "one round of ten sweeps"): ("table1", "multi, 5", "multi, 1"),
-    ("five rounds of ten sweeps", "without priority"): ("table2", "prioritized", "not prioritized"),
-    ("five rounds of ten sweeps", "five rounds of one sweep"): ("table1", "multi, 5", "single, 5"),
-    ("one round of ten sweeps", "one round of one sweep"): ("table1", "multi, 1", "single, 1"),
-    ("five rounds of ten sweeps", "one round of one sweep"): ("table1", "multi, 5", "single, 1"),
-    (_WITH_OFFSETS, "one round of ten sweeps"): ("table1", "multi, 5", "multi, 1"),
-    (_WITH_OFFSETS, "one round of one sweep"): ("table1", "multi, 5", "single, 1"),
+def _mrv(rounds: int, sweeps: int, priority: bool = True) -> Change:
+    return change(num_sweeps=sweeps, projection__num_rounds=rounds, projection__prioritize_current=priority)
+
+
+CLAIMS = (
+    Claim("five rounds instead of one, one sweep", _mrv(5, 1), _mrv(1, 1), ("table1", "single, 5", "single, 1")),
+    Claim("five rounds instead of one, ten sweeps", _mrv(5, 10), _mrv(1, 10), ("table1", "multi, 5", "multi, 1")),
+    Claim("ten sweeps instead of one, one round", _mrv(1, 10), _mrv(1, 1), ("table1", "multi, 1", "single, 1")),
+    Claim("ten sweeps instead of one, five rounds", _mrv(5, 10), _mrv(5, 1), ("table1", "multi, 5", "single, 5")),
+    Claim("five rounds, ten sweeps instead of one", _mrv(5, 10), _mrv(1, 1), ("table1", "multi, 5", "single, 1")),
+    Claim("priority", _mrv(5, 10), _mrv(5, 10, False), ("table2", "prioritized", "not prioritized")),
+    Claim("heads that are not tied", _mrv(5, 10), change(model__tied_heads=True), ("table6", "untied", "tied")),
+)
+NETWORKS = {
+    "small network": change(),
+    "with local geometry": change(model__local_geometry=True),
+    "and a second look": change(model__local_geometry=True, refinement=QUARTER_LOOK),
 }
-"""Row and reference in networks with local geometry -> table, row and reference of the paper."""
 
 
 def verdict_of_figure(figure: Figure, ours: float) -> str:
@@ -159,9 +164,12 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     return "disagrees", ""
 
 
-def gains_of(claim: Claim, scale: Simulated, cells: Mapping[tuple[str, int], Cell], score: str) -> list[float]:
-    """Return a row's gains over its reference in points, one per seed with both cells."""
-    names, gains = [changes_of(row.change(scale.base), scale.base) for row in (claim.row, claim.reference)], []
+def gains_of(
+    claim: Claim, network: Change, scale: Simulated, cells: Mapping[tuple[str, int], Cell], score: str
+) -> list[float]:
+    """Return the gains of a claim with a network in points, one per seed with both cells."""
+    configs = [own(network(scale.base)) for own in (claim.change, claim.reference)]
+    names, gains = [changes_of(config, scale.base) for config in configs], []
     for seed in sorted({seed for _, seed in cells}):
         own, other = (cells.get((name, seed), {}).get("scores") for name in names)
         if own and other:
@@ -179,47 +187,24 @@ def figure_lines(results: Path) -> Iterator[str]:
         yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} |"
 
 
-def claims() -> Iterator[Claim]:
-    """Yield the rows of the paper's tables with a gain in a score, then those with local geometry."""
-    for table in TABLES.values():
-        for row in table.rows:
-            reference, paper = table.reference_of(row), table.paper_difference(row)
-            if row is not reference and paper:
-                yield Claim(f"{table.name}: {row.label} instead of {reference.label}", row, reference, paper)
-    tables = {
-        "small": mrv_ablations.SMALL,
-        "small, second look": mrv_ablations.SMALL_LOOKED_AGAIN,
-        "compact": mrv_ablations.TABLE,
-    }
-    for sizes, ablations in tables.items():
-        rows = {row.label: row for row in ablations.rows}
-        for (label, reference), (name, *pair_of_paper) in LOCAL_GEOMETRY.items():
-            if label not in rows:
-                continue
-            theirs, base = (PAPER["tables"][name]["rows"][key] for key in pair_of_paper)
-            full = label if reference != "without priority" else "with priority"
-            text = f"local geometry, {sizes}: {full} instead of {reference}"
-            yield Claim(text, rows[label], rows[reference], {s: round(theirs[s] - base[s], 2) for s in SCORES})
-
-
-def training_lines(results: Path) -> tuple[list[str], int]:
-    """Return a line of Markdown for each claim about accuracy, and the number of claims without scores."""
-    scale, lines, missing = quarter(Path("unused")), list[str](), 0
+def claim_lines(results: Path, score: str) -> Iterator[str]:
+    """Yield a line of Markdown for each claim about a score."""
+    scale = quarter(Path("unused"))
     cells = read_cells(results / "tables" / scale.name, scale)
-    for claim in claims():
-        gains = {score: gains_of(claim, scale, cells, score) for score in claim.paper}
-        if not gains["mAP"]:
-            missing += 1
-            continue
-        samples = scale.train_frames * claim.row.change(scale.base).optimizer.epochs
-        columns = [claim.text, f"{len(gains['mAP'])}, {samples:,}"]
-        for score, own in gains.items():
-            mean, *bounds = interval(own) or (sum(own) / len(own),)
-            ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
-            paper = claim.paper[score]
-            columns += [f"{paper:+.2f}", ours, ": ".join(filter(None, verdict(own, paper)))]
-        lines.append(f"| {' | '.join(columns)} |")
-    return lines, missing
+    for claim in CLAIMS:
+        table, *rows = claim.paper
+        theirs, reference = (PAPER["tables"][table]["rows"][row][score] for row in rows)
+        paper, columns = round(theirs - reference, 2), []
+        for network in NETWORKS.values():
+            gains = gains_of(claim, network, scale, cells, score)
+            columns.append(_said(gains, paper) if gains else "")
+        yield f"| {claim.text} | {paper:+.2f} | {' | '.join(columns)} |"
+
+
+def _said(gains: list[float], paper: float) -> str:
+    mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
+    ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
+    return f"{ours} {': '.join(filter(None, verdict(gains, paper)))}"
 
 
 def _table(columns: str, lines: Iterable[str]) -> str:
@@ -228,14 +213,11 @@ def _table(columns: str, lines: Iterable[str]) -> str:
 
 def as_markdown(results: Path) -> str:
     """Format the whole ledger."""
-    lines, missing = training_lines(results)
-    columns = "gain in points | seeds, samples | mAP, paper | here | verdict | NDS, paper | here | verdict"
-    parts = [
-        _table("without training | paper | here | from | verdict", figure_lines(results)),
-        _table(columns, lines),
-        f"{missing} other claims have no scores of both rows for a seed.\n\n{_OUR_NDS}",
-    ]
-    return "\n\n".join(parts) + "\n"
+    parts = [_table("without training | paper | here | from | verdict", figure_lines(results))]
+    for score in SCORES:
+        columns = f"gain in points of {score} | paper | {' | '.join(NETWORKS)}"
+        parts.append(_table(columns, claim_lines(results, score)))
+    return "\n\n".join([*parts, _OUR_NDS]) + "\n"
 
 
 def with_ledger(document: str, ledger: str) -> str:
