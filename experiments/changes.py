@@ -52,3 +52,5 @@ LARGER = {
 """Fields that return to the sizes of ``compact`` today."""
 QUARTER_LOOK = RefinementConfig(num_boxes=64)
 """The second look of ``compact`` for as many boxes as a quarter of the view has."""
+LONE_LOOK = dataclasses.replace(QUARTER_LOOK, num_neighbours=0)
+"""The same without the comparison of neighbours, as it was before 2026-11-29."""

@@ -12,7 +12,8 @@ frames of varied simulated streets, 3,000 steps of one frame, one one-cycle sche
 200 unseen frames, and on 60 of them after each quarter of the training. A second look (``refinement``) is trained
 in the same step ("joint"), or afterwards on the same frames ("looked at again"), with the first trial's weights
 frozen: 3,000 updates of four frames, in which the detector's boxes were found once. The seconds per step of the
-latter are its whole time without the detector's training, divided by the steps.
+latter are its whole time without the detector's training, divided by the steps. Only "neighbours" compares each
+box with its neighbours, as ``compact`` does.
 
 The same command resumes a trial; a second look afterwards starts again. Trials that are already in the file of
 ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the committed
@@ -31,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from experiments.cached import CachedFrames
-from experiments.changes import LARGER, QUARTER_LOOK, SLIM, Change, change
+from experiments.changes import LARGER, LONE_LOOK, QUARTER_LOOK, SLIM, Change, change
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
@@ -77,7 +78,7 @@ MARKED = "second round marks objects"
 AFTERWARDS = {"larger, looked at again": "larger", "CenterPoint, looked at again": "CenterPoint"}
 """Trials of a second look, and the trials whose weights it gets, frozen."""
 _FROZEN = change(
-    refinement=dataclasses.replace(QUARTER_LOOK, freeze_detector=True),
+    refinement=dataclasses.replace(LONE_LOOK, freeze_detector=True),
     optimizer__peak_learning_rate=2e-3,
     optimizer__max_gradient_norm=5.0,
 )
@@ -89,8 +90,10 @@ TRIALS: dict[str, Change] = {
     "larger": change(**LARGER),
     "larger, without local geometry": change(**LARGER, model__local_geometry=False),
     MARKED: change(**LARGER, projection__num_rounds=2),
-    "local geometry, joint": change(refinement=QUARTER_LOOK),
-    "larger, joint": change(**LARGER, refinement=QUARTER_LOOK),
+    "local geometry, joint": change(refinement=LONE_LOOK),
+    "local geometry, joint, neighbours": change(refinement=QUARTER_LOOK),
+    "larger, joint": change(**LARGER, refinement=LONE_LOOK),
+    "larger, joint, neighbours": change(**LARGER, refinement=QUARTER_LOOK),
 }
 TRIALS |= {name: lambda config, first=first: _FROZEN(TRIALS[first](config)) for name, first in AFTERWARDS.items()}
 

@@ -32,6 +32,7 @@ LATER_FIELDS = {
     "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False, "round_offsets": False},
     "loss": {"quality": "iou", "centreness_m": 0.75, "refined_class_weight": 4.0, "refined_box_weight": 0.5},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none", "nms_across_classes": False},
+    "refinement": {"num_neighbours": 0, "pair_channels": [64, 64]},
 }
 """Configuration fields added to format 3 later, and their values in checkpoints without them."""
 LATER_SECTIONS = {"refinement": None}
@@ -299,7 +300,7 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     """Add the fields that a configuration of an earlier version lacks, and drop removed fields."""
     later: dict[str, Any] = {name: config.get(name, value) for name, value in LATER_SECTIONS.items()}
     for section, fields in LATER_FIELDS.items():
-        if isinstance(values := config.get(section, {}), dict):
+        if isinstance(values := later.get(section, config.get(section, {})), dict):
             gone = GONE_FIELDS.get(section, {})
             kept = {name: value for name, value in values.items() if name not in gone or value != gone[name]}
             later[section] = {**fields, **kept}

@@ -16,9 +16,9 @@ from fcos_lidar_jax.initialization import init_variables
 from fcos_lidar_jax.losses import cross_entropy
 from fcos_lidar_jax.nms import suppress
 from fcos_lidar_jax.refinement.crops import crop_points
-from fcos_lidar_jax.refinement.network import SecondLook, box_features, point_features
+from fcos_lidar_jax.refinement.network import SecondLook, box_features, find_neighbours, point_features
 from fcos_lidar_jax.refinement.targets import match_boxes, move_boxes
-from fcos_lidar_jax.refinement.types import RefinementTargets
+from fcos_lidar_jax.refinement.types import LookInputs, RefinementTargets
 from fcos_lidar_jax.types import Batch, Sums
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ def add_refinement(detector: "Detector") -> "Detector":
     >>> from fcos_lidar_jax.presets import COMPACT
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
     >>> variables = jax.eval_shape(build_detector(COMPACT, NUSCENES_HDL32E).init, jax.random.key(0))
-    >>> sorted(variables["params"]["refinement"])
-    ['box0', 'box1', 'norm0', 'norm1', 'norm2', 'out', 'point0', 'point1', 'point2']
+    >>> sorted({name.rstrip("0123456789") for name in variables["params"]["refinement"]})
+    ['box', 'norm', 'other', 'out', 'own', 'pair', 'point', 'together']
     """
     config, refinement = detector.config, _config_of(detector.config)
     network = make_network(config)
@@ -76,7 +76,8 @@ def without_second_look(variables: dict[str, Any]) -> dict[str, Any]:
 def make_network(config: Config) -> SecondLook:
     """The network of a configuration with a second look."""
     refinement, size = _config_of(config), 10 if _sees_motion(config) else 8
-    return SecondLook(len(config.classes), size, refinement.point_channels, refinement.box_channels)
+    channels = refinement.point_channels, refinement.box_channels, refinement.pair_channels
+    return SecondLook(len(config.classes), size, *channels)
 
 
 def _sees_motion(config: Config) -> bool:
@@ -113,18 +114,20 @@ def best_boxes(boxes: Boxes, number: int) -> Boxes:
     return cut[0], cut[1], cut[2], cut[3]
 
 
-def look_inputs(config: Config, points: Array, valid: Array, boxes: Boxes) -> tuple[Array, Array, Array]:
-    """Features of the points, their mask, and features of the boxes of one cloud."""
+def look_inputs(config: Config, points: Array, valid: Array, boxes: Boxes) -> LookInputs:
+    """Features of points, boxes and neighbours of one cloud."""
     refinement = _config_of(config)
-    place, scores, labels, _ = boxes
+    place, scores, labels, used = boxes
     crops = crop_points(points, valid, place, num_points=refinement.num_points, margin_m=refinement.margin_m)
     of_boxes = box_features(
         place, scores, labels, crops.count, len(config.classes), with_velocity=_sees_motion(config)
     )
-    return point_features(crops, place), crops.valid, of_boxes
+    number = refinement.num_neighbours
+    neighbours = find_neighbours(place, scores, labels, used, number) if number else None
+    return LookInputs(point_features(crops, place), crops.valid, of_boxes, neighbours)
 
 
-def look(network: SecondLook, variables: Any, inputs: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+def look(network: SecondLook, variables: Any, inputs: LookInputs) -> tuple[Array, Array]:
     """Class logits and residuals of boxes, from the results of :func:`look_inputs`."""
     outputs: Any = network.apply({"params": variables["params"][SECOND_LOOK]}, inputs)
     return outputs
@@ -168,12 +171,12 @@ def refinement_sums(detector: "Detector", variables: Any, outputs: Any, inputs: 
 
 def look_samples(
     detector: "Detector", outputs: Any, inputs: Any, batch: Batch
-) -> tuple[tuple[Array, Array, Array], RefinementTargets]:
+) -> tuple[LookInputs, RefinementTargets]:
     """Inputs of the second look for the detector's boxes of a batch, and their targets; without gradient."""
     config, refinement = detector.config, _config_of(detector.config)
     inference = proposal_inference(config)
 
-    def prepared(sample: Any) -> tuple[tuple[Array, Array, Array], RefinementTargets]:
+    def prepared(sample: Any) -> tuple[LookInputs, RefinementTargets]:
         outputs, input_, one = sample
         boxes = suppress(*detector.candidates(outputs, input_), inference)
         targets = match_boxes(
@@ -193,9 +196,7 @@ def look_samples(
     return over_samples(prepared, lax.stop_gradient((outputs, inputs, batch)))
 
 
-def look_sums(
-    config: Config, variables: Any, looked: tuple[Array, Array, Array], targets: RefinementTargets
-) -> Sums:
+def look_sums(config: Config, variables: Any, looked: LookInputs, targets: RefinementTargets) -> Sums:
     """The losses of the second look on boxes of several clouds, from the results of :func:`look_samples`."""
     logits, residual = look(make_network(config), variables, looked)
     entropy = jax.vmap(cross_entropy)(logits, targets.label)

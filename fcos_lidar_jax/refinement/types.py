@@ -25,6 +25,27 @@ class Crops:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Neighbours:
+    """The nearest other boxes of each box."""
+
+    index: Int32[Array, "*b m k"]  # Number of the neighbour among the boxes; arbitrary where invalid.
+    valid: Bool[Array, "*b m k"]  # False where there are fewer neighbours.
+    features: Float32[Array, "*b m k 10"]  # How the neighbour lies to the box, see ``network.find_neighbours``.
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class LookInputs:
+    """Inputs of the network."""
+
+    points: Float32[Array, "*b m p 14"]  # See ``network.point_features``.
+    valid: Bool[Array, "*b m p"]  # False for slots without a point.
+    boxes: Float32[Array, "*b m f"]  # See ``network.box_features``.
+    neighbours: Neighbours | None  # None if boxes are not compared.
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class RefinementTargets:
     """Targets of the boxes of one cloud."""
 

@@ -279,14 +279,18 @@ def _sensor_differences(was: Sensor, now: Sensor) -> Iterator[str]:
 
 
 def _with_second_look(where: Path, variables: Variables, detector: Detector) -> Variables:
-    """Variables with those of the second look that the detector has and they lack, or without those it lacks."""
-    params, trained = variables["params"], SECOND_LOOK in variables["params"]
-    if trained == (detector.refine is not None):
-        return variables
-    if trained:
-        tell(f"{where}: the second look is left out, since refinement is None")
+    """Variables with a second look of the detector's layers, or without one if the detector has none."""
+    params = variables["params"]
+    found = by_name(params.get(SECOND_LOOK, {})).keys()
+    if detector.refine is None:
+        if found:
+            tell(f"{where}: the second look is left out, since refinement is None")
         return without_second_look(variables)
-    tell(f"{where}: has no second look: it starts with random weights")
+    shapes = jax.eval_shape(detector.init, jax.random.key(0))["params"][SECOND_LOOK]
+    if found == by_name(shapes).keys():
+        return variables
+    has = "a second look with other layers" if found else "no second look"
+    tell(f"{where}: has {has}: it starts with random weights")
     new = jax.jit(detector.init)(jax.random.key(0))["params"][SECOND_LOOK]
     return variables | {"params": params | {SECOND_LOOK: new}}
 

@@ -16,6 +16,7 @@ from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.refinement.network import REACH_M
 from fcos_lidar_jax.refinement.stage import best_boxes, refinement_sums, trainable
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step, plan
 from fcos_lidar_jax.training.step import make_gradient
@@ -23,6 +24,7 @@ from fcos_lidar_jax.training.step import make_gradient
 pytestmark = pytest.mark.slow
 
 SMALL = dataclasses.replace(tiny_run.LOOK, first_score_weight=0.25)
+ALONE = dataclasses.replace(SMALL, num_neighbours=0)
 FROZEN = dataclasses.replace(SMALL, freeze_detector=True)
 
 
@@ -185,6 +187,19 @@ def test_several_sweeps_correct_velocities():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((gradients, metrics)))
 
 
+def test_only_boxes_nearby_decide_a_score():
+    model, variables = detector(SMALL)
+    batch, refine = host_batch(), jax.jit(model.refine)
+    nothing, labels = (batch.points[0], np.zeros(1024, bool)), np.array([0, 1])
+    place, scores = np.tile(batch.boxes[0][:1], (2, 1)), {}
+    for distance, valid in ((2.0, True), (3.0, True), (2 * REACH_M, True), (2.0, False)):
+        place[1, 0] = place[0, 0] + distance
+        found = refine(variables, *nothing, place, np.array([0.9, 0.5]), labels, np.array([True, valid]))
+        scores[distance, valid] = float(found[1][found[3] & (found[2] == 0)][0])
+    assert scores[2 * REACH_M, True] == scores[2.0, False]
+    assert len({*scores.values()}) == 3
+
+
 def test_centerpoint_takes_a_second_look_too():
     config = dataclasses.replace(tiny_peer.CONFIG, refinement=SMALL)
     model, batch = build_detector(config, SENSOR), tiny_peer.host_batch()
@@ -206,6 +221,7 @@ def test_training_starts_from_weights_with_or_without_a_second_look(tmp_path, ca
     for given, own, told in (
         (None, SMALL, "has no second look: it starts with random weights"),
         (SMALL, None, "the second look is left out"),
+        (ALONE, SMALL, "has a second look with other layers: it starts with random weights"),
     ):
         model, variables = detector(given)
         save_checkpoint(tmp_path / "weights", Checkpoint(model.config, SENSOR, variables, 1))

@@ -38,7 +38,9 @@ CONFIG = dataclasses.replace(
     inference=InferenceConfig(max_detections=20, candidates_per_level=20),
     optimizer=dataclasses.replace(QUICKSTART.optimizer, batch_size=2, ema_decay=0.9),
 )
-LOOK = RefinementConfig(num_boxes=8, num_points=16, point_channels=(8, 8), box_channels=(8,))
+LOOK = RefinementConfig(
+    num_boxes=8, num_points=16, point_channels=(8, 8), box_channels=(8,), num_neighbours=3, pair_channels=(8, 8)
+)
 REFINED = dataclasses.replace(CONFIG, refinement=LOOK)
 """The run with a second look."""
 NETWORK_OPTIONS = """
