@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from fcos_lidar_jax.config import Config, RefinementConfig
+from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.presets import COMPACT
 
 Change = Callable[[Config], Config]
@@ -50,7 +50,8 @@ LARGER = {
     },
 }
 """Fields that return to the sizes of ``compact`` today."""
-QUARTER_LOOK = RefinementConfig(num_boxes=64)
+assert COMPACT.refinement is not None
+QUARTER_LOOK = dataclasses.replace(COMPACT.refinement, num_boxes=64)
 """The second look of ``compact`` for as many boxes as a quarter of the view has."""
 LONE_LOOK = dataclasses.replace(QUARTER_LOOK, num_neighbours=0)
 """The same without the comparison of neighbours, as it was before 2026-11-29."""

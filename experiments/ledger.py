@@ -4,9 +4,9 @@
     python -m experiments.ledger --write  # also write it into experiments/README.md
 
 The ledger reads our figures from ``experiments/results``, without training or timing. A claim about accuracy is a
-gain of one row of a table of the paper over another. It is asked of small networks that are like the paper's, of
-the same networks with local geometry, and of those with a second look too, which the paper does not have. The
-verdict follows from the 95 % interval of the gain over the seeds:
+gain of one row of the paper's tables 1, 2 and 6 over another; the other tables have no scores yet. It is asked of
+small networks that are like the paper's, of the same networks with local geometry, and of those with a second look
+too, which the paper does not have. The verdict follows from the 95 % interval of the gain over the seeds:
 
 - excludes zero, with the paper's sign: agrees; agrees only in direction if it also excludes the paper's figure
 - excludes zero, with the other sign: disagrees
@@ -129,7 +129,7 @@ CLAIMS = (
 NETWORKS = {
     "small network": change(),
     "with local geometry": change(model__local_geometry=True),
-    "and a second look": change(model__local_geometry=True, refinement=QUARTER_LOOK),
+    "with a second look too": change(model__local_geometry=True, refinement=QUARTER_LOOK),
 }
 
 
@@ -197,14 +197,15 @@ def claim_lines(results: Path, score: str) -> Iterator[str]:
         paper, columns = round(theirs - reference, 2), []
         for network in NETWORKS.values():
             gains = gains_of(claim, network, scale, cells, score)
-            columns.append(_said(gains, paper) if gains else "")
+            columns.append(_said(gains, paper) if gains else "not trained")
         yield f"| {claim.text} | {paper:+.2f} | {' | '.join(columns)} |"
 
 
 def _said(gains: list[float], paper: float) -> str:
     mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
     ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
-    return f"{ours} {': '.join(filter(None, verdict(gains, paper)))}"
+    seeds = f"{len(gains)} seed{'s' * (len(gains) > 1)}, " if len(gains) != MIN_SEEDS else ""
+    return f"{ours} {seeds}{': '.join(filter(None, verdict(gains, paper)))}"
 
 
 def _table(columns: str, lines: Iterable[str]) -> str:

@@ -6,6 +6,7 @@ or another base are refused.
 """
 
 import csv
+import dataclasses
 import hashlib
 import io
 import json
@@ -18,7 +19,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from experiments.paper_tables.scales import Scale
 from experiments.script import compact_json, write_text
 from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
-from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.config import Config, RefinementConfig, config_to_json
 from fcos_lidar_jax.files import file_lock, read_json
 
 Cell = dict[str, Any]  # ``changes``, ``seed``, ``scores`` or ``diverged``, and hardware.
@@ -36,10 +37,18 @@ def changes_of(config: Config, base: Config) -> str:
     'num_sweeps=2, projection.num_rounds=3'
     >>> changes_of(QUICKSTART, QUICKSTART)
     'base'
+    >>> from fcos_lidar_jax.config import RefinementConfig
+    >>> changes_of(change(refinement=RefinementConfig(num_boxes=64))(QUICKSTART), QUICKSTART)
+    'refinement="on", refinement.num_boxes=64'
     """
+    added = {}
+    if config.refinement is not None and base.refinement is None:
+        added, base = {"refinement": "on"}, dataclasses.replace(base, refinement=RefinementConfig())
     own, before = (_flat(config_to_json(c)) for c in (config, base))
-    differing = [field for field in sorted(own.keys() - {"name"}) if before.get(field, ...) != own[field]]
-    return ", ".join(f"{field}={json.dumps(own[field])}" for field in differing) or "base"
+    differing = added | {
+        field: own[field] for field in own.keys() - {"name"} if before.get(field, ...) != own[field]
+    }
+    return ", ".join(f"{field}={json.dumps(differing[field])}" for field in sorted(differing)) or "base"
 
 
 def run_name(changes: str, seed: int) -> str:

@@ -73,7 +73,7 @@ def make_table(*, small: bool, second_look: bool = False) -> Table:
 
 
 TABLE, SMALL = make_table(small=False), make_table(small=True)
-SMALL_LOOKED_AGAIN = make_table(small=True, second_look=True)
+SMALL_WITH_SECOND_LOOK = make_table(small=True, second_look=True)
 
 
 def main(args: AblationArgs) -> None:

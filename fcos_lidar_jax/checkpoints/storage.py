@@ -32,7 +32,7 @@ LATER_FIELDS = {
     "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False, "round_offsets": False},
     "loss": {"quality": "iou", "centreness_m": 0.75, "refined_class_weight": 4.0, "refined_box_weight": 0.5},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none", "nms_across_classes": False},
-    "refinement": {"num_neighbours": 0, "pair_channels": [64, 64]},
+    "refinement": {"num_neighbours": 0, "pair_channels": (64, 64)},
 }
 """Configuration fields added to format 3 later, and their values in checkpoints without them."""
 LATER_SECTIONS = {"refinement": None}

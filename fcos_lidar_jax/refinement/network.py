@@ -14,7 +14,7 @@ from fcos_lidar_jax.refinement.types import Crops, LookInputs, Neighbours
 REACH_M = 10.0
 """Largest distance of a neighbour on the ground."""
 _FINE_M = 0.2  # Distance from the centre up to which asinh resolves positions finely.
-_FAR_M = 1e6
+_FAR_M = 1e6  # Distance of boxes that are no neighbours.
 _FULL = lax.Precision.HIGHEST  # Positions would be rounded to TF32 or bfloat16 otherwise.
 
 
@@ -99,7 +99,7 @@ def find_neighbours(
         jnp.cos(turn),
         jnp.sin(turn),
         (labels[index] == labels[:, None]).astype(jnp.float32),
-        (logit[index] - logit[:, None]) / 4,
+        (logit[index] - logit[:, None]) / 4,  # about as large as the others
     ]
     features = jnp.concatenate([jnp.stack(columns, axis=-1), size[index] - size[:, None]], axis=-1)
     return Neighbours(index, near, jnp.where(near[..., None], features, 0.0))
@@ -137,7 +137,7 @@ class SecondLook(nn.Module):
         return logits, residual.at[..., -1].add(1.0)  # Zero outputs leave a box as it is.
 
     def _compare(self, x: Array, neighbours: Neighbours) -> Array:
-        """Each box beside the maximum and the sum of the layers over its pairs."""
+        """Each box, with the maximum and the sum of the layers over its pairs; the sum counts neighbours."""
         first, *deeper = self.pair_channels
         own, other = (nn.Dense(first, kernel_init=_he, name=name)(x) for name in ("own", "other"))
         pairs = nn.Dense(first, kernel_init=_he, use_bias=False, precision=_FULL, name="pair0")(

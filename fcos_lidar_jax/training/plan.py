@@ -254,8 +254,9 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
         return jax.tree.map(lambda expected, leaf: jnp.asarray(leaf, expected.dtype), shapes, weights)
     folder = find_checkpoint(Path(weights))
     checkpoint = read_checkpoint(folder)
-    variables = _with_second_look(folder, checkpoint.variables, detector)
-    if (classes := checkpoint.config.classes) != detector.config.classes:
+    classes = checkpoint.config.classes
+    variables = _with_second_look(folder, checkpoint.variables, detector, classes)
+    if classes != detector.config.classes:
         variables = _for_other_classes(folder, classes, variables, detector)
     check_arrays(folder, shapes, variables, whose=whose)
     own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
@@ -278,21 +279,28 @@ def _sensor_differences(was: Sensor, now: Sensor) -> Iterator[str]:
         yield f"with the LiDAR at {was.origin_m} m, here at {now.origin_m} m"
 
 
-def _with_second_look(where: Path, variables: Variables, detector: Detector) -> Variables:
-    """Variables with a second look of the detector's layers, or without one if the detector has none."""
+def _with_second_look(where: Path, variables: Variables, detector: Detector, classes: Sequence[str]) -> Variables:
+    """Variables with the arrays of the detector's second look, random ones where none fits; or without one."""
     params = variables["params"]
-    found = by_name(params.get(SECOND_LOOK, {})).keys()
+    found = by_name(params.get(SECOND_LOOK, {}))
     if detector.refine is None:
         if found:
             tell(f"{where}: the second look is left out, since refinement is None")
         return without_second_look(variables)
-    shapes = jax.eval_shape(detector.init, jax.random.key(0))["params"][SECOND_LOOK]
-    if found == by_name(shapes).keys():
-        return variables
-    has = "a second look with other layers" if found else "no second look"
-    tell(f"{where}: has {has}: it starts with random weights")
     new = jax.jit(detector.init)(jax.random.key(0))["params"][SECOND_LOOK]
-    return variables | {"params": params | {SECOND_LOOK: new}}
+    own, same = by_name(new), classes == detector.config.classes  # otherwise shapes are compared later
+    fits = {n for n, leaf in own.items() if n in found and (found[n].shape == leaf.shape or not same)}
+    if fits == own.keys() == found.keys():
+        return variables
+    has = (
+        f"another second look: {len(own) - len(fits)} of {len(own)} arrays start"
+        if found
+        else ("no second look: it starts")
+    )
+    tell(f"{where}: has {has} with random weights")
+    leaves = [found[name] if name in fits else leaf for name, leaf in own.items()]
+    look = jax.tree.unflatten(jax.tree.structure(new), leaves)
+    return variables | {"params": params | {SECOND_LOOK: look}}
 
 
 def _for_other_classes(where: Path, was: Sequence[str], variables: Variables, detector: Detector) -> Variables:

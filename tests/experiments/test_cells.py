@@ -14,6 +14,7 @@ from experiments.paper_tables.cells import add_cell, changes_of, read_cells, run
 from experiments.paper_tables.scales import quarter
 from experiments.paper_tables.tables import as_markdown, make_record
 from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
+from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, QUICKSTART
 
 SECTOR = RESULTS / "tables" / "sector"
@@ -76,7 +77,8 @@ def test_cells_of_another_scale_are_refused_and_the_field_is_named(tmp_path):
 def test_a_later_field_of_the_configuration_refuses_only_what_it_changes(tmp_path):
     earlier = {(section, field): v for section, fields in LATER_FIELDS.items() for field, v in fields.items()}
     defaults = {f"{section}__{field}": value for (section, field), value in earlier.items()}
-    scale = Pretended(base=change(**defaults)(QUICKSTART))
+    whole = change(refinement=RefinementConfig())(QUICKSTART)
+    scale = Pretended(base=change(**defaults)(whole))
     add_cell(tmp_path, scale, CELL, locks=tmp_path)
     file = tmp_path / "scale.json"
     record = json.loads(file.read_text())
@@ -84,6 +86,6 @@ def test_a_later_field_of_the_configuration_refuses_only_what_it_changes(tmp_pat
         record["base"][section].pop(field, None)
     file.write_text(json.dumps(record))
     assert read_cells(tmp_path, scale)
-    flipped = dataclasses.replace(scale, base=change(**defaults | {"inference__flips": "y"})(QUICKSTART))
+    flipped = dataclasses.replace(scale, base=change(**defaults | {"inference__flips": "y"})(whole))
     with pytest.raises(ValueError, match=r"base\.inference\.flips: got 'none', expected 'y'"):
         read_cells(tmp_path, flipped)

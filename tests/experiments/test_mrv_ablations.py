@@ -4,7 +4,7 @@ import pytest
 
 from experiments.paper_tables.cells import changes_of
 from experiments.paper_tables.scales import quarter, smoke
-from experiments.studies.mrv_ablations import SMALL, SMALL_LOOKED_AGAIN, TABLE
+from experiments.studies.mrv_ablations import SMALL, SMALL_WITH_SECOND_LOOK, TABLE
 
 CHANGED = {
     "one round of ten sweeps": "projection.num_rounds=1",
@@ -16,10 +16,10 @@ CHANGED = {
 }
 
 
-@pytest.mark.parametrize("table", [TABLE, SMALL, SMALL_LOOKED_AGAIN])
+@pytest.mark.parametrize("table", [TABLE, SMALL, SMALL_WITH_SECOND_LOOK])
 @pytest.mark.parametrize("make_scale", [quarter, smoke])
 def test_every_row_changes_the_named_part_only(tmp_path, make_scale, table):
-    base, second_look = make_scale(tmp_path).base, table is SMALL_LOOKED_AGAIN
+    base, second_look = make_scale(tmp_path).base, table is SMALL_WITH_SECOND_LOOK
     whole, *configs = (row.change(base) for row in table.rows)
     assert (whole.num_sweeps, whole.projection.num_rounds, whole.projection.prioritize_current) == (10, 5, True)
     number = len(CHANGED) - 2 * second_look

@@ -21,10 +21,10 @@ from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
 
 
 def test_each_row_is_compared_with_centerpoint_on_its_sweeps():
-    for table in (centerpoint.TABLE, centerpoint.SECOND_LOOK):
+    for table in (centerpoint.TABLE, centerpoint.WITH_SECOND_LOOK):
         for row in [row for row in table.rows if row.label.startswith("FCOS-LiDAR")]:
             assert table.reference_of(row).label == f"CenterPoint, {row.label.rpartition(', ')[2]}"
-    looks = [row.change(quarter(Path("unused")).base).refinement for row in centerpoint.LOOKED_AGAIN]
+    looks = [row.change(quarter(Path("unused")).base).refinement for row in centerpoint.ROWS_WITH_SECOND_LOOK]
     assert None not in looks
     assert len({*looks}) == 1
 
