@@ -41,7 +41,7 @@ from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.config import CloudReading, Config
+from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.files import checksum, read_json
@@ -75,13 +75,14 @@ BASE: Change = change(
     augment__max_rotation_rad=math.radians(5),
 )
 MARKED = "second round marks objects"
-AFTERWARDS = {"larger, looked at again": "larger", "CenterPoint, looked at again": "CenterPoint"}
-"""Trials of a second look, and the trials whose weights it gets, frozen."""
-_FROZEN = change(
-    refinement=dataclasses.replace(LONE_LOOK, freeze_detector=True),
-    optimizer__peak_learning_rate=2e-3,
-    optimizer__max_gradient_norm=5.0,
-)
+_SMALL = "local geometry, joint, neighbours"
+AFTERWARDS = {
+    "larger, looked at again": ("larger", LONE_LOOK),
+    "CenterPoint, looked at again": ("CenterPoint", LONE_LOOK),
+    f"{_SMALL}, looked at again": (_SMALL, QUARTER_LOOK),
+    f"{_SMALL}, looked at again without them": (_SMALL, LONE_LOOK),
+}
+"""Trials of a second look, the trials whose weights it gets, frozen, and its configuration."""
 UPDATES = 3000  # Updates of a second look that is trained afterwards.
 TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
@@ -91,11 +92,22 @@ TRIALS: dict[str, Change] = {
     "larger, without local geometry": change(**LARGER, model__local_geometry=False),
     MARKED: change(**LARGER, projection__num_rounds=2),
     "local geometry, joint": change(refinement=LONE_LOOK),
-    "local geometry, joint, neighbours": change(refinement=QUARTER_LOOK),
+    _SMALL: change(refinement=QUARTER_LOOK),
     "larger, joint": change(**LARGER, refinement=LONE_LOOK),
     "larger, joint, neighbours": change(**LARGER, refinement=QUARTER_LOOK),
 }
-TRIALS |= {name: lambda config, first=first: _FROZEN(TRIALS[first](config)) for name, first in AFTERWARDS.items()}
+
+
+def _afterwards(first: str, look: RefinementConfig) -> Change:
+    frozen = change(
+        refinement=dataclasses.replace(look, freeze_detector=True),
+        optimizer__peak_learning_rate=2e-3,
+        optimizer__max_gradient_norm=5.0,
+    )
+    return lambda config: frozen(TRIALS[first](config))
+
+
+TRIALS |= {name: _afterwards(*how) for name, how in AFTERWARDS.items()}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -167,8 +179,8 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
         seen, tests = Marked(seen), Marked(tests)
     curve_frames = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
     folder = run_folder(name, seed, args)
-    if (first := AFTERWARDS.get(name)) is not None:
-        began, weights = time.monotonic(), load_trained(run_folder(first, seed, args))
+    if name in AFTERWARDS:
+        began, weights = time.monotonic(), load_trained(run_folder(AFTERWARDS[name][0], seed, args))
         detector = look_again(weights, config, seen, samples=args.steps, updates=UPDATES, seed=seed)
         seconds, records = [(time.monotonic() - began) / args.steps], []
         save_checkpoint(folder, Checkpoint(config, detector.sensor, detector.variables, args.steps))
