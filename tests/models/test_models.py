@@ -286,7 +286,7 @@ def test_circular_network_commutes_with_a_turn():
     [
         (NUSCENES, 10_661_558, 0),
         (NUSCENES_TEST, 16_836_662, 0),
-        (COMPACT, 1_978_833, 0),
+        (COMPACT, 2_033_041, 0),
         (with_model(NUSCENES, fpn_channels=64), 5.7e6, 6e4),
         (with_model(NUSCENES, fpn_channels=128), 6.9e6, 6e4),
     ],
