@@ -191,7 +191,7 @@ class RefinementConfig(Checked):
     margin_m: Amount = 1.0  # Boxes are enlarged by this on every side, metres.
     point_channels: Counts = (32, 64, 128)  # Channels of the layers on each point.
     box_channels: Counts = (128, 128)  # Channels of the layers on each box.
-    num_neighbours: Natural = 16  # Nearest boxes within 10 m that each box is compared with.
+    num_neighbours: Natural = 16  # Nearest boxes, within 10 m, that each box is compared with; 0: none.
     pair_channels: Counts = (64, 64)  # Channels of the layers on each pair of a box and a neighbour.
     move_boxes: bool = True  # Move the boxes in detection; without, only their scores change.
     first_score_weight: Share = 0.0

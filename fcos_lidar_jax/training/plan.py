@@ -280,7 +280,7 @@ def _sensor_differences(was: Sensor, now: Sensor) -> Iterator[str]:
 
 
 def _with_second_look(where: Path, variables: Variables, detector: Detector, classes: Sequence[str]) -> Variables:
-    """Variables with the arrays of the detector's second look, random ones where none fits; or without one."""
+    """Variables with the arrays of the detector's second look, random arrays where none fits."""
     params = variables["params"]
     found = by_name(params.get(SECOND_LOOK, {}))
     if detector.refine is None:
@@ -292,12 +292,12 @@ def _with_second_look(where: Path, variables: Variables, detector: Detector, cla
     fits = {n for n, leaf in own.items() if n in found and (found[n].shape == leaf.shape or not same)}
     if fits == own.keys() == found.keys():
         return variables
-    has = (
-        f"another second look: {len(own) - len(fits)} of {len(own)} arrays start"
-        if found
-        else ("no second look: it starts")
-    )
-    tell(f"{where}: has {has} with random weights")
+    if found:
+        left_out = len(found.keys() - own.keys())
+        changes = f"{len(own) - len(fits)} of {len(own)} arrays start with random weights, {left_out} are left out"
+        tell(f"{where}: has another second look: {changes}")
+    else:
+        tell(f"{where}: has no second look: it starts with random weights")
     leaves = [found[name] if name in fits else leaf for name, leaf in own.items()]
     look = jax.tree.unflatten(jax.tree.structure(new), leaves)
     return variables | {"params": params | {SECOND_LOOK: look}}

@@ -238,8 +238,8 @@ def test_training_starts_from_weights_with_or_without_a_second_look(tmp_path, ca
     for given, own, told in (
         (None, SMALL, "has no second look: it starts with random weights"),
         (SMALL, None, "the second look is left out"),
-        (ALONE, SMALL, "has another second look: 9 of 21 arrays start with random weights"),
-        (SMALL, ALONE, "has another second look: 0 of 12 arrays start with random weights"),
+        (ALONE, SMALL, "has another second look: 9 of 21 arrays start with random weights, 0 are left out"),
+        (SMALL, ALONE, "has another second look: 0 of 12 arrays start with random weights, 9 are left out"),
     ):
         model, variables = detector(given)
         save_checkpoint(tmp_path / "weights", Checkpoint(model.config, SENSOR, variables, 1))
