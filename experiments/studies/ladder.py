@@ -12,8 +12,8 @@ frames of varied simulated streets, 3,000 steps of one frame, one one-cycle sche
 200 unseen frames, and on 60 of them after each quarter of the training. A second look (``refinement``) is trained
 in the same step ("joint"), or afterwards on the same frames ("looked at again"), with the first trial's weights
 frozen: 3,000 updates of four frames, in which the detector's boxes were found once. The seconds per step of the
-latter are its whole time without the detector's training, divided by the steps. Only "neighbours" compares each
-box with its neighbours, as ``compact`` does.
+latter are its whole time without the detector's training, divided by the steps. Only "neighbours" and "local
+geometry, looked at again" compare each box with its neighbours, as ``compact`` does.
 
 The same command resumes a trial; a second look afterwards starts again. Trials that are already in the file of
 ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the committed
@@ -79,6 +79,7 @@ _SMALL = "local geometry, joint, neighbours"
 AFTERWARDS = {
     "larger, looked at again": ("larger", LONE_LOOK),
     "CenterPoint, looked at again": ("CenterPoint", LONE_LOOK),
+    "local geometry, looked at again": ("local geometry", QUARTER_LOOK),
     f"{_SMALL}, looked at again": (_SMALL, QUARTER_LOOK),
     f"{_SMALL}, looked at again without them": (_SMALL, LONE_LOOK),
 }
