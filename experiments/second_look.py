@@ -1,20 +1,26 @@
 """The second look trained on the boxes of a frozen detector, which are found only once per frame.
 
-``train --weights`` with ``refinement.freeze_detector`` runs the detector in each step. Here each update sees four
-frames whose boxes are in memory, and a frame is used several times.
+``train --weights`` with ``refinement.freeze_detector`` runs the detector in each step. Here each frame is used
+several times. An update should see four frames: with one, the second look learns much less from neighbours, see
+``experiments/LOG.md``, 2026-11-30.
 """
 
 import dataclasses
 import functools
+import itertools
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import optax
+from numpy.lib.format import open_memmap
 
+from experiments.script import write_text
 from fcos_lidar_jax.augment import augment
-from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.files import checksum, read_json
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import build_detector
@@ -23,21 +29,32 @@ from fcos_lidar_jax.refinement.stage import SECOND_LOOK, look_samples, look_sums
 from fcos_lidar_jax.training import make_optimizer
 from fcos_lidar_jax.training.objective import batch_metrics
 
-FRAMES = 4  # Frames per update.
+_DONE = "done.json"
+_SAVE_EVERY = 50  # Samples.
 
 
 def look_again(
-    first: TrainedDetector, config: Config, frames: FrameSet, *, samples: int, updates: int, seed: int
+    first: TrainedDetector,
+    config: Config,
+    frames: FrameSet,
+    *,
+    samples: int,
+    updates: int,
+    seed: int,
+    folder: Path,
 ) -> TrainedDetector:
     """Train a second look for a detector.
 
     Args:
         first: the detector, which stays as it is.
-        config: its configuration with ``refinement``; its schedule has ``updates`` steps here.
+        config: its configuration with ``refinement``. Its schedule has ``updates`` steps here, and its batch size
+            is the number of frames per update.
         samples: number of augmented frames, in the order in which ``train`` takes them.
+        folder: folder of the boxes that the detector finds, up to a megabyte per sample. The same folder resumes
+            the search for boxes; the updates start again.
     """
     detector = build_detector(config, first.sensor)
-    looked = _found(first, config, frames, samples, seed)
+    looked = _found(first, config, frames, samples, seed, folder)
     optimizer = make_optimizer(config.optimizer, updates)
     variables = detector.init(jax.random.key(seed))
     look = variables["params"][SECOND_LOOK]
@@ -53,17 +70,18 @@ def look_again(
         return optax.apply_updates(look, changes), state, value
 
     state, order = jax.jit(optimizer.init)(look), np.random.default_rng(seed)
+    number = min(config.optimizer.batch_size, samples)
     progress = Progress("updates", updates)
     for step in range(updates):
-        chosen = order.choice(samples, min(FRAMES, samples), replace=False)
+        chosen = order.choice(samples, number, replace=False)
         look, state, value = update(look, state, jax.tree.map(lambda leaf, i=chosen: leaf[i], looked))
         progress.show(step + 1, f"loss {value:.3f}" if step % 100 == 0 else "")
     params = {**first.variables["params"], SECOND_LOOK: jax.device_get(look)}
     return TrainedDetector(detector, {**first.variables, "params": params})
 
 
-def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: int, seed: int) -> Any:
-    """What the second look sees in each sample, and its targets, stacked."""
+def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: int, seed: int, folder: Path) -> Any:
+    """What the second look sees in each sample, and its targets, stacked in files of a folder."""
     detector = build_detector(config, first.sensor)
     assert config.augment is not None  # as in all trials
     augment_one = functools.partial(augment, config=config.augment, origin_m=first.sensor.origin_m)
@@ -77,9 +95,39 @@ def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: in
         return jax.tree.map(lambda leaf: leaf[0], look_samples(detector, outputs, inputs, batch))
 
     one = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, batch_size=1))
-    found, progress = [], Progress("frames", samples)
-    with make_batches(frames, one, seed=seed, num_steps=samples, threads=1) as batches:
-        for number, host in enumerate(batches):
-            found.append(jax.device_get(find(jax.random.fold_in(jax.random.key(seed), number), host.batch)))
+    weights = checksum(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(first.variables)))
+    of = checksum(repr((weights, config_to_json(one), frames.fingerprint(), samples, seed)).encode())
+    done = _done(folder, of)
+    progress = Progress("frames", samples)
+    start = min(done, samples - 1)  # one frame in any case, for the shapes
+    with make_batches(frames, one, seed=seed, num_steps=samples, first_step=start, threads=1) as batches:
+        first_batch = next(batches)
+        shapes = jax.eval_shape(find, jax.random.key(seed), first_batch.batch)
+        leaves, tree = jax.tree.flatten(shapes)
+        stored = [_array(folder / f"{i}.npy", (samples, *leaf.shape), leaf.dtype) for i, leaf in enumerate(leaves)]
+        for number, host in zip(range(done, samples), itertools.chain([first_batch], batches), strict=False):
+            found = jax.device_get(find(jax.random.fold_in(jax.random.key(seed), number), host.batch))
+            for array, leaf in zip(stored, jax.tree.leaves(found), strict=True):
+                array[number] = leaf
+            if (number + 1) % _SAVE_EVERY == 0 or number + 1 == samples:
+                for array in stored:
+                    array.flush()
+                write_text(folder / _DONE, f'{{"of": "{of}", "done": {number + 1}}}\n')
             progress.show(number + 1)
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+    return jax.tree.unflatten(tree, stored)
+
+
+def _done(folder: Path, of: str) -> int:
+    """Number of samples that are in the folder."""
+    file = folder / _DONE
+    if not file.exists():
+        return 0
+    stored = read_json(file, dict[str, Any])
+    if stored["of"] != of:
+        raise ValueError(f"{folder}: found the boxes of another training, expected another folder")
+    return int(stored["done"])
+
+
+def _array(file: Path, shape: tuple[int, ...], dtype: Any) -> np.memmap:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return open_memmap(file, mode="r+") if file.exists() else open_memmap(file, "w+", dtype=dtype, shape=shape)

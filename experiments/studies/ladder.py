@@ -15,10 +15,10 @@ frozen: 3,000 updates of four frames, in which the detector's boxes were found o
 latter are its whole time without the detector's training, divided by the steps. Only "neighbours" and "local
 geometry, looked at again" compare each box with its neighbours, as ``compact`` does.
 
-The same command resumes a trial; a second look afterwards starts again. Trials that are already in the file of
-``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the committed
-trials. ``experiments/LOG.md`` has an entry per question. Cost: half an hour of one core per trial, and some
-minutes once for the frames.
+The same command resumes a trial, except for the updates of a second look afterwards. Trials that are already in
+the file of ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the
+committed trials. ``experiments/LOG.md`` has an entry per question. Cost: half an hour of one core per trial, and
+some minutes once for the frames.
 """
 
 import dataclasses
@@ -104,6 +104,7 @@ def _afterwards(first: str, look: RefinementConfig) -> Change:
         refinement=dataclasses.replace(look, freeze_detector=True),
         optimizer__peak_learning_rate=2e-3,
         optimizer__max_gradient_norm=5.0,
+        optimizer__batch_size=4,
     )
     return lambda config: frozen(TRIALS[first](config))
 
@@ -182,7 +183,8 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     folder = run_folder(name, seed, args)
     if name in AFTERWARDS:
         began, weights = time.monotonic(), load_trained(run_folder(AFTERWARDS[name][0], seed, args))
-        detector = look_again(weights, config, seen, samples=args.steps, updates=UPDATES, seed=seed)
+        numbers = {"samples": args.steps, "updates": UPDATES, "seed": seed}
+        detector = look_again(weights, config, seen, **numbers, folder=args.work / f"boxes_{folder.name}")
         seconds, records = [(time.monotonic() - began) / args.steps], []
         save_checkpoint(folder, Checkpoint(config, detector.sensor, detector.variables, args.steps))
     else:

@@ -19,10 +19,11 @@ streets from ``seed * frames``; choose a seed whose streets no earlier training 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --steps 15000 --seed 1 \
         --batch-size 4 --learning-rate 4e-3 --simulators 12 --workers 3  # on a GPU
 
-``--second-look`` trains only the second look, with the detector of ``--warm-start`` frozen:
+``--second-look`` trains only the second look, with the detector of ``--warm-start`` frozen. Its boxes are found
+once per frame and kept in the folder of the run, a megabyte per frame; each frame is then used ten times:
 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/second_look --warm-start hdl32e \
-        --second-look --seed 4 --steps 8000 --simulators 1
+        --second-look --seed 4 --steps 12500 --batch-size 4 --learning-rate 2e-3
 
 ``--average CHECKPOINT`` exports the average with the weights of an earlier training, such as those that this one
 started from: a training on other streets loses some of what the earlier one had learned. The logits
@@ -39,6 +40,7 @@ frames took 568 s on an H200. Expected: an mAP of at least 0.6 for quickstart.
 import dataclasses
 import math
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -52,6 +54,7 @@ from experiments.hardware import hardware
 from experiments.pool import PooledFrames, simulating
 from experiments.runs import detections, trained
 from experiments.script import Options, compact_json, run_script, save, write_text
+from experiments.second_look import look_again
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
@@ -116,6 +119,7 @@ _AVERAGE_SHARE = 0.3  # Share of the earlier weights in an average.
 _NICE = 10
 _CURVE_FRAMES = 40  # Unseen frames of evaluations during training.
 _STREETS, _POOLED = "streets", "pool.json"  # Folder and record of repeated streets, in the folder of the run.
+_LOOK, _USES = "second_look.json", 10  # Record of a second look; updates that see each of its frames.
 _POOL = 100_000  # Streets to simulate at most, if they repeat.
 _KEPT = 50  # Checkpoints of a run without evaluations.
 
@@ -179,10 +183,13 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     os.nice(_NICE)
     given: dict[str, Any] = {"optimizer__batch_size": args.batch_size}
     given |= {} if args.learning_rate is None else {"optimizer__peak_learning_rate": args.learning_rate}
-    given |= {"refinement__freeze_detector": True} if args.second_look else {}
+    if args.second_look:
+        given |= {"refinement__freeze_detector": True, "optimizer__max_gradient_norm": 5.0}
     config = change(**given)(CONFIGS[args.name])
     # Rejects before hours of training what the export would reject.
     earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
+    if args.second_look:
+        return train_second_look(args, work, config)
     number = _POOL // config.optimizer.batch_size if args.simulators else args.steps
     frames, unseen = streets(config, steps=number, seed=args.seed)
     run = {"steps": args.steps, "seed": args.seed, "weights": args.warm_start, "workers": args.workers}
@@ -198,6 +205,33 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     record = {"streets": len(pool.made()), "device": hardware()["device"]}
     write_text(work / _POOLED, compact_json(record) + "\n")
     return training_record(work)
+
+
+def train_second_look(args: Args, work: Path, config: Config) -> dict[str, Any]:
+    """Train a second look on the boxes of a frozen detector, and write its checkpoint and record."""
+    assert args.warm_start is not None
+    assert config.refinement is not None
+    first, began = load_trained(args.warm_start), time.monotonic()
+    frames, _ = streets(config, steps=max(args.steps // _USES, 1), seed=args.seed)
+    numbers = {"samples": len(frames), "updates": args.steps, "seed": args.seed}
+    detector = look_again(first, config, frames, **numbers, folder=work / "boxes")
+    checkpoint = Checkpoint(config, detector.sensor, detector.variables, args.steps)
+    save_checkpoint(work / CHECKPOINTS / f"{args.steps:08d}", checkpoint)
+    record = {
+        "preset": config.name,
+        "parameters": count_parameters(detector.variables["params"])["total"],
+        "seed": args.seed,
+        "begun_with": str(args.warm_start),
+        "steps": args.steps,
+        "frames_seen": len(frames),
+        "seconds": round(time.monotonic() - began),
+        "curve": [],
+        "trained": "second look",
+        "num_boxes": config.refinement.num_boxes,
+        "num_points": config.refinement.num_points,
+    }
+    write_text(work / _LOOK, compact_json(record) + "\n")
+    return record
 
 
 def curve_of(work: Path) -> list[list[float]]:
@@ -219,13 +253,12 @@ def evaluated(detector: TrainedDetector, number: int) -> Evaluation:
 
 def training_record(run: Path) -> dict[str, Any]:
     """Summarise the training of a run."""
+    if (run / _LOOK).exists():
+        return read_json(run / _LOOK, dict[str, Any])
     checkpoint, spec = load_checkpoint(run), read_json(run / "run.json", dict[str, Any])
     config, done = checkpoint.config, checkpoint.step
     records = [record for record in read_metrics(run) if record["step"] <= done]  # may go on after the checkpoint
-    batch, look, pooled = config.optimizer.batch_size, config.refinement, run / _POOLED
-    only_look = {}
-    if look is not None and look.freeze_detector:
-        only_look = {"trained": "second look", "num_boxes": look.num_boxes, "num_points": look.num_points}
+    batch, pooled = config.optimizer.batch_size, run / _POOLED
     return {
         "preset": config.name,
         "parameters": count_parameters(checkpoint.variables["params"])["total"],
@@ -236,7 +269,6 @@ def training_record(run: Path) -> dict[str, Any]:
         "frames_seen": done * batch,
         "seconds_of_steps": round(sum(r.get("seconds", 0.0) for r in records)),
         "curve": [[r["step"] * batch, round(r["test/mAP"], 4)] for r in records if "test/mAP" in r],
-        **only_look,
         **(read_json(pooled, dict[str, Any]) if pooled.exists() else {}),
     }
 
@@ -337,6 +369,8 @@ def main(args: Args) -> None:
     """Score, train or export; the next export reads the record of this one."""
     if args.second_look and args.warm_start is None:
         raise ValueError("--second-look: expected the detector to freeze in --warm-start")
+    if args.second_look and (args.simulators or args.workers):
+        raise ValueError("--simulators, --workers: expected none with --second-look")
     if args.work is None:
         if args != Args(name=args.name, test_frames=args.test_frames, out=args.out):
             raise ValueError("--work: missing, expected the folder of the training that the other options are for")
