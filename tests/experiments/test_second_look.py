@@ -1,0 +1,41 @@
+"""A second look trained on the boxes of a frozen detector."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+from linear_network import linear_network
+from tiny_run import FRAMES, REFINED, SENSOR, bits, weights
+
+from experiments.second_look import look_again
+from fcos_lidar_jax.config import AugmentConfig
+from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.models import build_detector
+
+
+@pytest.mark.slow
+def test_the_search_for_boxes_resumes_and_the_detector_stays(tmp_path):
+    config = dataclasses.replace(REFINED, augment=AugmentConfig())
+    with linear_network():
+        first = TrainedDetector(build_detector(config, SENSOR), weights(config))
+        args = {"samples": 4, "updates": 3, "folder": tmp_path}
+        before = look_again(first, config, FRAMES, seed=1, **args).variables["params"]
+        (tmp_path / "done.json").write_text(
+            json.dumps(json.loads((tmp_path / "done.json").read_text()) | {"done": 2})
+        )
+        for file in tmp_path.glob("*.npy"):
+            np.lib.format.open_memmap(file, "r+")[2:] = 0
+        after = look_again(first, config, FRAMES, seed=1, **args).variables["params"]
+        assert bits(after) == bits(before)
+        assert bits({**after, "refinement": ()}) == bits({**first.variables["params"], "refinement": ()})
+        look = after["refinement"]
+        assert all(
+            (old != new).any()
+            for old, new in zip(
+                *map(jax.tree.leaves, (weights(config)["params"]["refinement"], look)), strict=True
+            )
+        )
+        with pytest.raises(ValueError, match=r"found the boxes of another training, expected another folder"):
+            look_again(first, config, FRAMES, seed=2, **args)
