@@ -74,12 +74,11 @@ class PeerArgs(Args):
     second_look: bool = False  # Both detectors with a second look.
 
 
-def figures(args: Args) -> dict[str, Any]:
+def figures(args: Args, table: Table) -> dict[str, Any]:
     """Measure times of the stages and of a training step, and count parameters, by row."""
     scale = simulated_scale(args)
     assert scale is not None
     calls, columns = dict[tuple[str, str], Call](), {}
-    table = WITH_SECOND_LOOK if isinstance(args, PeerArgs) and args.second_look else TABLE
     for row in table.only(args.rows).rows:
         config = row.change(scale.base)
         frame = scale.frames("test", config.num_sweeps).frame(0)
@@ -121,19 +120,23 @@ def _percent(scores: list[float]) -> str:
     return ", ".join(f"{100 * score:.1f}" for score in scores)
 
 
-_PARTS: dict[str, Any] = {"reference": PEER.label, "figures": figures, "lines": equal_time}
-_TITLE = "CenterPoint and the range view"
-TABLE = Table("centerpoint", _TITLE, ROWS, **_PARTS)
-WITH_SECOND_LOOK = Table(
-    "centerpoint_second_look", f"{_TITLE}, with a second look", ROWS_WITH_SECOND_LOOK, **_PARTS
-)
+def make_table(*, second_look: bool = False) -> Table:
+    """Create the table; its files are named after the second look."""
+    name = "centerpoint" + "_second_look" * second_look
+    title = "CenterPoint and the range view" + ", with a second look" * second_look
+    rows = ROWS_WITH_SECOND_LOOK if second_look else ROWS
+    table = Table(name, title, rows, reference=PEER.label, lines=equal_time)
+    return dataclasses.replace(table, figures=lambda args: figures(args, table))
+
+
+TABLE, WITH_SECOND_LOOK = make_table(), make_table(second_look=True)
 
 
 def main(args: PeerArgs) -> None:
     """Train and print the table."""
     if args.scale == "nuscenes":
         raise ValueError("--scale: got nuscenes, expected smoke or sector")
-    run_table(WITH_SECOND_LOOK if args.second_look else TABLE, args)
+    run_table(make_table(second_look=args.second_look), args)
 
 
 if __name__ == "__main__":
