@@ -1,8 +1,7 @@
 """The second look trained on the boxes of a frozen detector, which are found only once per frame.
 
 ``train --weights`` with ``refinement.freeze_detector`` runs the detector in each step. Here each frame is used
-several times. An update should see four frames: with one, the second look learns much less from neighbours, see
-``experiments/LOG.md``, 2026-11-30.
+several times, since a second look needs more updates than a detector (``experiments/LOG.md``, 2026-11-30).
 """
 
 import dataclasses
