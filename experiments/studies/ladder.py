@@ -11,9 +11,10 @@ nuScenes' HDL-32E (32 x 272 pixels) with one sweep, and one round except in "sec
 frames of varied simulated streets, 3,000 steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on
 200 unseen frames, and on 60 of them after each quarter of the training. A second look (``refinement``) is trained
 in the same step ("joint"), or afterwards on the same frames ("looked at again"), with the first trial's weights
-frozen: 3,000 updates of four frames, in which the detector's boxes were found once. The seconds per step of the
-latter are its whole time without the detector's training, divided by the steps. Only "neighbours" and "local
-geometry, looked at again" compare each box with its neighbours, as ``compact`` does.
+frozen and boxes that were found once: by 3,000 updates of four frames, or, after "local geometry", by 24,000 of
+one of 2,000 frames. The seconds per step of the latter are its whole time without the detector's training, divided
+by the steps. Only "neighbours" and "local geometry, looked at again" compare each box with its neighbours, as
+``compact`` does.
 
 The same command resumes a trial, except for the updates of a second look afterwards. Trials that are already in
 the file of ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the
@@ -76,15 +77,36 @@ BASE: Change = change(
 )
 MARKED = "second round marks objects"
 _SMALL = "local geometry, joint, neighbours"
+
+
+@dataclasses.dataclass(frozen=True)
+class Afterwards:
+    """A second look that is trained on the frozen weights of another trial."""
+
+    first: str  # The trial whose weights it gets.
+    look: RefinementConfig
+    samples: int | None = None  # Augmented frames in which boxes are found; default: as many as the steps.
+    updates: int = 3000
+    batch_size: int = 4  # Frames per update.
+
+    def change(self) -> Change:
+        """Create the change of the configuration."""
+        frozen = change(
+            refinement=dataclasses.replace(self.look, freeze_detector=True),
+            optimizer__peak_learning_rate=2e-3,
+            optimizer__max_gradient_norm=5.0,
+            optimizer__batch_size=self.batch_size,
+        )
+        return lambda config: frozen(TRIALS[self.first](config))
+
+
 AFTERWARDS = {
-    "larger, looked at again": ("larger", LONE_LOOK),
-    "CenterPoint, looked at again": ("CenterPoint", LONE_LOOK),
-    "local geometry, looked at again": ("local geometry", QUARTER_LOOK),
-    f"{_SMALL}, looked at again": (_SMALL, QUARTER_LOOK),
-    f"{_SMALL}, looked at again without them": (_SMALL, LONE_LOOK),
+    "larger, looked at again": Afterwards("larger", LONE_LOOK),
+    "CenterPoint, looked at again": Afterwards("CenterPoint", LONE_LOOK),
+    f"{_SMALL}, looked at again": Afterwards(_SMALL, QUARTER_LOOK),
+    f"{_SMALL}, looked at again without them": Afterwards(_SMALL, LONE_LOOK),
+    "local geometry, looked at again": Afterwards("local geometry", QUARTER_LOOK, 2000, 24_000, 1),
 }
-"""Trials of a second look, the trials whose weights it gets, frozen, and its configuration."""
-UPDATES = 3000  # Updates of a second look that is trained afterwards.
 TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
@@ -99,17 +121,7 @@ TRIALS: dict[str, Change] = {
 }
 
 
-def _afterwards(first: str, look: RefinementConfig) -> Change:
-    frozen = change(
-        refinement=dataclasses.replace(look, freeze_detector=True),
-        optimizer__peak_learning_rate=2e-3,
-        optimizer__max_gradient_norm=5.0,
-        optimizer__batch_size=4,
-    )
-    return lambda config: frozen(TRIALS[first](config))
-
-
-TRIALS |= {name: _afterwards(*how) for name, how in AFTERWARDS.items()}
+TRIALS |= {name: how.change() for name, how in AFTERWARDS.items()}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -182,8 +194,9 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     curve_frames = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
     folder = run_folder(name, seed, args)
     if name in AFTERWARDS:
-        began, weights = time.monotonic(), load_trained(run_folder(AFTERWARDS[name][0], seed, args))
-        numbers = {"samples": args.steps, "updates": UPDATES, "seed": seed}
+        how, began = AFTERWARDS[name], time.monotonic()
+        weights = load_trained(run_folder(how.first, seed, args))
+        numbers = {"samples": how.samples or args.steps, "updates": how.updates, "seed": seed}
         detector = look_again(weights, config, seen, **numbers, folder=args.work / f"boxes_{folder.name}")
         seconds, records = [(time.monotonic() - began) / args.steps], []
         save_checkpoint(folder, Checkpoint(config, detector.sensor, detector.variables, args.steps))

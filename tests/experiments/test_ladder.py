@@ -8,7 +8,7 @@ import pytest
 import tiny_run
 from linear_network import linear_network
 
-from experiments.changes import SLIM, change
+from experiments.changes import LONE_LOOK, SLIM, change
 from experiments.ledger import RESULTS
 from experiments.studies import ladder
 from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, Marked, measure
@@ -39,7 +39,8 @@ def test_the_trials_are_the_networks_of_the_committed_scores():
 @pytest.mark.slow
 def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys):
     """Two steps on two small frames with a linear network: that everything is there, not what it is."""
-    sizes = {"TRAIN_FRAMES": 2, "TEST_FRAMES": 2, "CURVE_FRAMES": 1, "UPDATES": 2}
+    again = {"larger, looked at again": ladder.Afterwards("larger", LONE_LOOK, updates=2)}
+    sizes = {"TRAIN_FRAMES": 2, "TEST_FRAMES": 2, "CURVE_FRAMES": 1, "AFTERWARDS": again}
     sizes |= {"SENSOR": tiny_run.SENSOR, "BASE": lambda config: change(max_points=1024)(BASE(config))}
     for name, value in sizes.items():
         monkeypatch.setattr(ladder, name, value)
