@@ -55,3 +55,5 @@ QUARTER_LOOK = dataclasses.replace(COMPACT.refinement, num_boxes=64)
 """The second look of ``compact`` for as many boxes as a quarter of the view has."""
 LONE_LOOK = dataclasses.replace(QUARTER_LOOK, num_neighbours=0)
 """The same without the comparison of neighbours, as it was before 2026-11-29."""
+FROZEN_LOOK = dataclasses.replace(QUARTER_LOOK, freeze_detector=True)
+"""The second look of tables: trained afterwards, on the boxes of the frozen detector."""

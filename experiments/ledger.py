@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.benchmarks.latency import PAPER_STAGES
-from experiments.changes import QUARTER_LOOK, Change, change
+from experiments.changes import FROZEN_LOOK, Change, change
 from experiments.paper import PAPER
 from experiments.paper_tables.cells import Cell, changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
@@ -129,7 +129,7 @@ CLAIMS = (
 NETWORKS = {
     "small network": change(),
     "with local geometry": change(model__local_geometry=True),
-    "with a second look too": change(model__local_geometry=True, refinement=QUARTER_LOOK),
+    "with a second look too": change(model__local_geometry=True, refinement=FROZEN_LOOK),
 }
 
 

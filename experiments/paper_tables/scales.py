@@ -26,6 +26,7 @@ from experiments.changes import SLIM, change
 from experiments.pool import simulating
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
+from experiments.second_look import USES, look_again, look_config
 from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.data.frame import Frame, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -48,6 +49,7 @@ from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
 from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
+_LOOK_SAMPLES = 2000  # Augmented frames in which boxes are found for a second look.
 _CURVE_FRAMES = 100  # Test frames of evaluations during training.
 _PROCESSES = 4  # Processes assumed to share the cores, so that each reads frames with a quarter of the threads.
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, which leaves a trail in fused sweeps.
@@ -144,6 +146,7 @@ class Simulated:
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """Train in a folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}, "errors"}``.
 
+        A second look with ``freeze_detector`` is trained afterwards, on boxes in 2,000 of the frames.
         ``errors`` are nuScenes' errors of true positives: means over the classes, and of cars. With
         ``evaluations`` also ``curve``, [[samples, mAP]], ``ranges``, scores by distance, and ``seconds_of_steps``.
         """
@@ -154,7 +157,13 @@ class Simulated:
         if self.evaluations:
             first = SelectedFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
             options |= {"tests": first, "schedule": Schedule(-(-steps // 20), -(-steps // self.evaluations))}
-        detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
+        look = config.refinement if config.refinement is not None and config.refinement.freeze_detector else None
+        first = config if look is None else dataclasses.replace(config, refinement=None)
+        detector = trained(folder, first, frames, steps=steps, seed=seed, objects=objects, **options)
+        if look is not None:
+            samples = min(_LOOK_SAMPLES, len(frames))
+            numbers = {"samples": samples, "updates": USES * samples, "seed": seed, "folder": folder / "boxes"}
+            detector = look_again(detector, look_config(first, look), frames, **numbers)
         boxes, test_frames = detections(detector, tests)
         scores = _scores(benchmark(boxes, test_frames).summary)
         if not self.evaluations:

@@ -37,7 +37,7 @@ from experiments.changes import LARGER, LONE_LOOK, QUARTER_LOOK, SLIM, Change, c
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
-from experiments.second_look import look_again
+from experiments.second_look import look_again, look_config
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
@@ -91,13 +91,7 @@ class Afterwards:
 
     def change(self) -> Change:
         """Create the change of the configuration."""
-        frozen = change(
-            refinement=dataclasses.replace(self.look, freeze_detector=True),
-            optimizer__peak_learning_rate=2e-3,
-            optimizer__max_gradient_norm=5.0,
-            optimizer__batch_size=self.batch_size,
-        )
-        return lambda config: frozen(TRIALS[self.first](config))
+        return lambda config: look_config(TRIALS[self.first](config), self.look, batch_size=self.batch_size)
 
 
 AFTERWARDS = {
@@ -119,8 +113,6 @@ TRIALS: dict[str, Change] = {
     "larger, joint": change(**LARGER, refinement=LONE_LOOK),
     "larger, joint, neighbours": change(**LARGER, refinement=QUARTER_LOOK),
 }
-
-
 TRIALS |= {name: how.change() for name, how in AFTERWARDS.items()}
 
 

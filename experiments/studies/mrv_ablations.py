@@ -11,8 +11,8 @@ and see 16,000 samples in batches of four, with a higher learning rate. The firs
 with priority. Four rows have fewer rounds, fewer sweeps or no priority, and one row has no local geometry. The
 paper's figures for one round, one sweep and no priority are -2.06, -3.66 and -2.79 points of mAP. Round offsets
 are the offsets between the points of each pixel's rounds: without them, the heads see the local geometry of the
-first round only. With ``--second-look``, the first five rows have the second look of ``compact``, trained in the
-same step; it sees the points of all sweeps, also those that no round shows.
+first round only. With ``--second-look``, the first five rows have the second look of ``compact``, trained
+afterwards on the boxes of the frozen detector; it sees the points of all sweeps, also those that no round shows.
 
 Processes with the same folders share the cells; one of them can have ``--simulators 12`` on a machine with many
 cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and 3.5 minutes per cell with two processes side
@@ -23,7 +23,7 @@ by side; six fit its memory. On a CPU core, several hours per cell; with ``--sma
 import dataclasses
 from typing import Any
 
-from experiments.changes import LARGER, QUARTER_LOOK, change
+from experiments.changes import FROZEN_LOOK, LARGER, change
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
 from fcos_lidar_jax.config import Config
@@ -47,7 +47,7 @@ class AblationArgs(Args):
 
 def make_table(*, small: bool, second_look: bool = False) -> Table:
     """Create the table; its files are named after the sizes and the second look."""
-    refinement = QUARTER_LOOK if second_look else None
+    refinement = FROZEN_LOOK if second_look else None
 
     def row(label: str, local_geometry: bool = True, **fields: Any) -> Row:
         own = change(model__local_geometry=local_geometry, refinement=refinement, **fields)

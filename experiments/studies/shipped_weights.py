@@ -20,10 +20,10 @@ streets from ``seed * frames``; choose a seed whose streets no earlier training 
         --batch-size 4 --learning-rate 4e-3 --simulators 12 --workers 3  # on a GPU
 
 ``--second-look`` trains only the second look, with the detector of ``--warm-start`` frozen. Its boxes are found
-once per frame and kept in the folder of the run, a megabyte per frame; each frame is then used ten times:
+once per frame and kept in the folder of the run, a megabyte per frame; each frame is then used twelve times:
 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/second_look --warm-start hdl32e \
-        --second-look --seed 4 --steps 12500 --batch-size 4 --learning-rate 2e-3
+        --second-look --seed 4 --steps 38400
 
 ``--average CHECKPOINT`` exports the average with the weights of an earlier training, such as those that this one
 started from: a training on other streets loses some of what the earlier one had learned. The logits
@@ -54,7 +54,7 @@ from experiments.hardware import hardware
 from experiments.pool import PooledFrames, simulating
 from experiments.runs import detections, trained
 from experiments.script import Options, compact_json, run_script, save, write_text
-from experiments.second_look import look_again
+from experiments.second_look import USES, look_again, look_config
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
@@ -119,7 +119,7 @@ _AVERAGE_SHARE = 0.3  # Share of the earlier weights in an average.
 _NICE = 10
 _CURVE_FRAMES = 40  # Unseen frames of evaluations during training.
 _STREETS, _POOLED = "streets", "pool.json"  # Folder and record of repeated streets, in the folder of the run.
-_LOOK, _USES = "second_look.json", 10  # Record of a second look; updates that see each of its frames.
+_LOOK = "second_look.json"  # Record of a second look.
 _POOL = 100_000  # Streets to simulate at most, if they repeat.
 _KEPT = 50  # Checkpoints of a run without evaluations.
 
@@ -181,11 +181,12 @@ def streets(config: Config, *, steps: int, seed: int) -> tuple[FrameSet, FrameSe
 def train(args: Args, work: Path) -> dict[str, Any]:
     """Start or resume the run and train to its end."""
     os.nice(_NICE)
-    given: dict[str, Any] = {"optimizer__batch_size": args.batch_size}
-    given |= {} if args.learning_rate is None else {"optimizer__peak_learning_rate": args.learning_rate}
+    config = change(optimizer__batch_size=args.batch_size)(CONFIGS[args.name])
     if args.second_look:
-        given |= {"refinement__freeze_detector": True, "optimizer__max_gradient_norm": 5.0}
-    config = change(**given)(CONFIGS[args.name])
+        assert config.refinement is not None
+        config = look_config(config, config.refinement, batch_size=args.batch_size)
+    if args.learning_rate is not None:
+        config = change(optimizer__peak_learning_rate=args.learning_rate)(config)
     # Rejects before hours of training what the export would reject.
     earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
     if args.second_look:
@@ -212,7 +213,7 @@ def train_second_look(args: Args, work: Path, config: Config) -> dict[str, Any]:
     assert args.warm_start is not None
     assert config.refinement is not None
     first, began = load_trained(args.warm_start), time.monotonic()
-    frames, _ = streets(config, steps=max(args.steps // _USES, 1), seed=args.seed)
+    frames, _ = streets(config, steps=max(args.steps // USES, 1), seed=args.seed)
     numbers = {"samples": len(frames), "updates": args.steps, "seed": args.seed}
     detector = look_again(first, config, frames, **numbers, folder=work / "boxes")
     checkpoint = Checkpoint(config, detector.sensor, detector.variables, args.steps)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.changes import QUARTER_LOOK, change
+from experiments.changes import FROZEN_LOOK, change
 from experiments.ledger import (
     CLAIMS,
     NETWORKS,
@@ -92,7 +92,7 @@ def test_gains_are_of_the_same_network():
         "num_sweeps=1": 0.3,
         "projection.prioritize_current=false": 0.6,
     }
-    look = changes_of(change(refinement=QUARTER_LOOK)(SCALE.base), SCALE.base)
+    look = changes_of(change(refinement=FROZEN_LOOK)(SCALE.base), SCALE.base)
     cells = {}
     for name, score in scores.items():
         for network, factor in ((), 1), (tuple(re.split(", (?=[a-z])", look)), 2):
