@@ -17,7 +17,7 @@ from numpy.lib.format import open_memmap
 
 from experiments.script import write_text
 from fcos_lidar_jax.augment import augment
-from fcos_lidar_jax.config import Config, RefinementConfig, config_to_json
+from fcos_lidar_jax.config import Config, OptimizerConfig, RefinementConfig, config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.files import checksum, read_json
 from fcos_lidar_jax.inference import TrainedDetector
@@ -26,6 +26,7 @@ from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.refinement.stage import SECOND_LOOK, look_samples, look_sums
 from fcos_lidar_jax.training import make_optimizer
+from fcos_lidar_jax.training.loop import NonFiniteLossError
 from fcos_lidar_jax.training.objective import batch_metrics
 
 USES = 12  # Updates that see each frame. With 24,000 updates the score still rises, see ``experiments/LOG.md``.
@@ -80,12 +81,14 @@ def look_again(
         return optax.apply_updates(look, changes), state, value
 
     state, order = jax.jit(optimizer.init)(look), np.random.default_rng(seed)
-    number = min(config.optimizer.batch_size, samples)
+    number, value = min(config.optimizer.batch_size, samples), np.nan
     progress = Progress("updates", updates)
     for step in range(updates):
         chosen = order.choice(samples, number, replace=False)
         look, state, value = update(look, state, jax.tree.map(lambda leaf, i=chosen: leaf[i], looked))
         progress.show(step + 1, f"loss {value:.3f}" if step % 100 == 0 else "")
+    if not np.isfinite(value):
+        raise NonFiniteLossError(f"second look: loss {value} after {updates} updates")
     params = {**first.variables["params"], SECOND_LOOK: jax.device_get(look)}
     return TrainedDetector(detector, {**first.variables, "params": params})
 
@@ -105,7 +108,7 @@ def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: in
         outputs, _ = detector.apply(first.variables, inputs)
         return jax.tree.map(lambda leaf: leaf[0], look_samples(detector, outputs, inputs, batch))
 
-    one = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, batch_size=1))
+    one = dataclasses.replace(config, optimizer=OptimizerConfig(batch_size=1))
     weights = checksum(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(first.variables)))
     of = checksum(repr((weights, config_to_json(one), frames.fingerprint(), samples, seed)).encode())
     done = _done(folder, of)
@@ -115,7 +118,10 @@ def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: in
         first_batch = next(batches)
         shapes = jax.eval_shape(find, jax.random.key(seed), first_batch.batch)
         leaves, tree = jax.tree.flatten(shapes)
-        stored = [_array(folder / f"{i}.npy", (samples, *leaf.shape), leaf.dtype) for i, leaf in enumerate(leaves)]
+        stored = [
+            _array(folder / f"{i}.npy", (samples, *leaf.shape), leaf.dtype, begun=done > 0)
+            for i, leaf in enumerate(leaves)
+        ]
         for number, host in zip(range(done, samples), itertools.chain([first_batch], batches), strict=False):
             found = jax.device_get(find(jax.random.fold_in(jax.random.key(seed), number), host.batch))
             for array, leaf in zip(stored, jax.tree.leaves(found), strict=True):
@@ -139,6 +145,6 @@ def _done(folder: Path, of: str) -> int:
     return int(stored["done"])
 
 
-def _array(file: Path, shape: tuple[int, ...], dtype: Any) -> np.memmap:
+def _array(file: Path, shape: tuple[int, ...], dtype: Any, *, begun: bool) -> np.memmap:
     file.parent.mkdir(parents=True, exist_ok=True)
-    return open_memmap(file, mode="r+") if file.exists() else open_memmap(file, "w+", dtype=dtype, shape=shape)
+    return open_memmap(file, "r+") if begun else open_memmap(file, "w+", dtype=dtype, shape=shape)

@@ -40,7 +40,7 @@ from experiments.script import Options, run_script, save
 from experiments.second_look import look_again, look_config
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
-from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
@@ -187,7 +187,10 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     folder = run_folder(name, seed, args)
     if name in AFTERWARDS:
         how, began = AFTERWARDS[name], time.monotonic()
-        weights = load_trained(run_folder(how.first, seed, args))
+        first = run_folder(how.first, seed, args)
+        if (step := load_checkpoint(first).step) != args.steps:
+            raise ValueError(f"{first}: got {step} steps, expected {args.steps}: train {how.first!r} first")
+        weights = load_trained(first)
         numbers = {"samples": how.samples or args.steps, "updates": how.updates, "seed": seed}
         detector = look_again(weights, config, seen, **numbers, folder=args.work / f"boxes_{folder.name}")
         seconds, records = [(time.monotonic() - began) / args.steps], []

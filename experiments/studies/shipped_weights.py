@@ -217,6 +217,7 @@ def train_second_look(args: Args, work: Path, config: Config) -> dict[str, Any]:
     numbers = {"samples": len(frames), "updates": args.steps, "seed": args.seed}
     detector = look_again(first, config, frames, **numbers, folder=work / "boxes")
     checkpoint = Checkpoint(config, detector.sensor, detector.variables, args.steps)
+    (work / CHECKPOINTS).mkdir(exist_ok=True)
     save_checkpoint(work / CHECKPOINTS / f"{args.steps:08d}", checkpoint)
     record = {
         "preset": config.name,
@@ -325,7 +326,7 @@ def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
     look = config.refinement
     if look is not None and today.refinement is not None:
         numbers = {n: getattr(today.refinement, n) for n in ("num_boxes", "num_points", "first_score_weight")}
-        look = dataclasses.replace(look, **numbers)
+        look = dataclasses.replace(look, **numbers, freeze_detector=False)
     config = dataclasses.replace(config, inference=today.inference, refinement=look)
     return dataclasses.replace(checkpoint, config=config)
 
@@ -368,8 +369,8 @@ def export(args: Args, work: Path) -> dict[str, Any]:
 
 def main(args: Args) -> None:
     """Score, train or export; the next export reads the record of this one."""
-    if args.second_look and args.warm_start is None:
-        raise ValueError("--second-look: expected the detector to freeze in --warm-start")
+    if args.second_look and str(args.warm_start) != args.name:  # whose logits are adjusted
+        raise ValueError(f"--second-look: got --warm-start {args.warm_start}, expected {args.name}")
     if args.second_look and (args.simulators or args.workers):
         raise ValueError("--simulators, --workers: expected none with --second-look")
     if args.work is None:

@@ -19,7 +19,7 @@ _RANGE_VIEW_LOSSES = (
 class CenterPointConfig(Config):
     """Definition of a CenterPoint detector and its training, without the data.
 
-    ``model`` and the rounds of ``projection`` are ignored.
+    Rounds and priority of ``projection`` are ignored.
     """
 
     pillars: PillarConfig = PillarConfig()  # Pillars, network and targets.

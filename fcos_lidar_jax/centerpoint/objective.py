@@ -11,6 +11,7 @@ from fcos_lidar_jax.centerpoint.centres import centre_targets, decode_centres, e
 from fcos_lidar_jax.centerpoint.pillar_config import PillarConfig
 from fcos_lidar_jax.centerpoint.pillars import Grid
 from fcos_lidar_jax.centerpoint.types import CentreOutputs
+from fcos_lidar_jax.collectives import sum_over_devices
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.iou import oriented, oriented_iou_3d
 from fcos_lidar_jax.losses import l1_loss
@@ -84,11 +85,10 @@ def make_sums(
             lambda *sample: sample_losses(*sample, config=config, pillars=pillars, grid=grid)
         )(outputs, batch.boxes, batch.labels, batch.box_valid)
         parts, counts = jax.tree.map(lambda leaf: leaf.sum(axis=0), (parts, counts))
-        by_group = counts["positives"]
-        positives = by_group.sum()
-        share = jnp.maximum(positives, 1) / jnp.maximum(by_group, 1)
+        by_group = sum_over_devices(counts["positives"])
+        share = jnp.maximum(by_group.sum(), 1) / jnp.maximum(by_group, 1)
         losses = {name: (part * share).sum() for name, part in parts.items()}
         means = {"positives": {"positive_iou": counts["iou_sum"]}}
-        return Sums({"positives": losses}, {"positives": positives}, means)
+        return Sums({"positives": losses}, {"positives": counts["positives"].sum()}, means)
 
     return sums

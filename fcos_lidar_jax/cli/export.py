@@ -32,7 +32,7 @@ class Export:
     batch: Annotated[Size, Needs("format", "jax"), option("N|any")] = 1
     """Clouds per call, or any number. Another size changes boxes and scores by rounding."""
     network_only: Annotated[bool, Needs("format", "onnx")] = False
-    """Leave out projection, decoding and NMS. Needs --format onnx."""
+    """Leave out projection, decoding, NMS and second look. Needs --format onnx."""
     format: Literal["jax", "onnx"] = "jax"  # A program of jax.export, or an ONNX graph.
 
 

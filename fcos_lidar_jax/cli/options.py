@@ -53,7 +53,7 @@ Close = Annotated[
     option(
         "{all,sweeps,none}",
         default="as the detector was trained",
-        text="Drop points within a metre of the sensor in x and y: all sweeps, only older sweeps, or none.",
+        text="Drop points near the sensor (usually within a metre in x and y): all sweeps, older sweeps, or none.",
     ),
 ]
 Columns = Annotated[

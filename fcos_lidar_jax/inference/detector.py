@@ -177,7 +177,7 @@ class TrainedDetector(CloudDetector):
     def without_second_look(self) -> "TrainedDetector":
         """Remove the second look: the result has the boxes and scores of the detector itself."""
         model = build_detector(dataclasses.replace(self.config, refinement=None), self.sensor)
-        return TrainedDetector(model, without_second_look(self.variables))
+        return dataclasses.replace(self, model=model, variables=without_second_look(self.variables))
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         if mesh not in self._placed:

@@ -155,10 +155,12 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
         _check_pasting(spec, -(-order.epoch_size // config.optimizer.batch_size))
     if config.augment is not None:
         check_augmentation(config.augment, frames.sensor)
+    if config.refinement is not None and config.refinement.freeze_detector:
+        check(spec.weights is not None, "refinement.freeze_detector", True, "False without weights of a detector")
     detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, spec.steps)
     jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(spec.seed))
     begun = spec.resume and Checkpoints(spec.out / CHECKPOINTS).paths()
-    weights = None if begun else _initial_weights(detector, spec.weights)
+    weights = None if begun else _initial_weights(detector, spec.weights, spec.seed)
     warnings = tuple(_warnings(frames, config))
     return Run(spec, _record(spec, detector, weights), detector, optimizer, order, weights, warnings)
 
@@ -244,7 +246,9 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
         raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
 
 
-def _initial_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
+def _initial_weights(
+    detector: Detector, weights: str | Path | Variables | None, seed: int = 0
+) -> Variables | None:
     """Load initial weights, and report differences of the network's configuration that shapes do not show."""
     if weights is None:
         return None
@@ -255,9 +259,9 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
     folder = find_checkpoint(Path(weights))
     checkpoint = read_checkpoint(folder)
     classes = checkpoint.config.classes
-    variables = _with_second_look(folder, checkpoint.variables, detector, classes)
+    variables = _with_second_look(folder, checkpoint.variables, detector, classes, seed)
     if classes != detector.config.classes:
-        variables = _for_other_classes(folder, classes, variables, detector)
+        variables = _for_other_classes(folder, classes, variables, detector, seed)
     check_arrays(folder, shapes, variables, whose=whose)
     own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
     for name, was, now in _differences(own, new, "model"):
@@ -279,7 +283,9 @@ def _sensor_differences(was: Sensor, now: Sensor) -> Iterator[str]:
         yield f"with the LiDAR at {was.origin_m} m, here at {now.origin_m} m"
 
 
-def _with_second_look(where: Path, variables: Variables, detector: Detector, classes: Sequence[str]) -> Variables:
+def _with_second_look(
+    where: Path, variables: Variables, detector: Detector, classes: Sequence[str], seed: int
+) -> Variables:
     """Variables with the arrays of the detector's second look, random arrays where none fits."""
     params = variables["params"]
     found = by_name(params.get(SECOND_LOOK, {}))
@@ -287,7 +293,7 @@ def _with_second_look(where: Path, variables: Variables, detector: Detector, cla
         if found:
             tell(f"{where}: the second look is left out, since refinement is None")
         return without_second_look(variables)
-    new = jax.jit(detector.init)(jax.random.key(0))["params"][SECOND_LOOK]
+    new = jax.jit(detector.init)(jax.random.key(seed))["params"][SECOND_LOOK]
     own, same = by_name(new), classes == detector.config.classes  # otherwise shapes are compared later
     fits = {n for n, leaf in own.items() if n in found and (found[n].shape == leaf.shape or not same)}
     if fits == own.keys() == found.keys():
@@ -303,10 +309,12 @@ def _with_second_look(where: Path, variables: Variables, detector: Detector, cla
     return variables | {"params": params | {SECOND_LOOK: look}}
 
 
-def _for_other_classes(where: Path, was: Sequence[str], variables: Variables, detector: Detector) -> Variables:
+def _for_other_classes(
+    where: Path, was: Sequence[str], variables: Variables, detector: Detector, seed: int
+) -> Variables:
     """Variables with random arrays where an array depends on the number of classes or does not fit."""
     doubled = build_detector(detector.config.with_doubled_classes(), detector.sensor)
-    new, more = jax.jit(detector.init)(jax.random.key(0)), jax.eval_shape(doubled.init, jax.random.key(0))
+    new, more = jax.jit(detector.init)(jax.random.key(seed)), jax.eval_shape(doubled.init, jax.random.key(0))
     found, own, more = (by_name(tree) for tree in (variables, new, more))
     fits = {n for n, x in own.items() if n in found and found[n].shape == x.shape == more[n].shape}
     if not fits:  # the weights of another detector, which are refused

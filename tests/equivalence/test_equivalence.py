@@ -68,7 +68,7 @@ def double(tree):
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64 if leaf.dtype == np.float32 else None), tree)
 def steps(config, n):
     batch = make_batch(frames, max_points=config.max_points, max_boxes=config.max_boxes)
-    if config is tiny_peer.CONFIG:  # computes in the precision of its points; the projection takes float32
+    if config is peer:  # computes in the precision of its points; the projection takes float32
         batch = double(batch)
     detector = build_detector(config, SENSOR)
     optimizer = optax.sgd(0.1, 0.9)  # AdamW turns rounding of a gradient near zero into a full-size step
@@ -82,7 +82,9 @@ SENSOR = dataclasses.replace(SENSOR, num_columns=32)  # convolutions in float64 
 frames = [dataclasses.replace(FRAMES, sensor=SENSOR, number=8).frame(i) for i in range(8)]
 frames[1] = dataclasses.replace(frames[1], points=frames[1].points[:0])
 ours = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, batch_size=8, accumulate=2))
-config, n = {"ours": (ours, 4), "peer": (tiny_peer.CONFIG, 2)}[sys.argv[1]]
+pillars = dataclasses.replace(tiny_peer.CONFIG.pillars, groups=(0, 1) * 5)  # with unequal numbers of boxes
+peer = dataclasses.replace(tiny_peer.CONFIG, pillars=pillars)
+config, n = {"ours": (ours, 4), "peer": (peer, 2)}[sys.argv[1]]
 one, other = ((new.params, new.batch_stats, new.ema, metrics) for new, metrics in steps(config, n))
 assert int(one[3]["dropped_points"]) > 0 and float(one[3]["gradient_norm"]) > 0
 for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
