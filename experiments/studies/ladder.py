@@ -3,18 +3,16 @@
     python -m experiments.studies.ladder --trials base CenterPoint
     python -m experiments.studies.ladder --trials base "local geometry" --seeds 0 1 2
     python -m experiments.studies.ladder --trials "local geometry" larger  # the sizes of compact today
-    python -m experiments.studies.ladder --trials larger "second round marks objects"  # can it use a second round?
     python -m experiments.studies.ladder --trials larger "larger, looked at again" "larger, joint" --seeds 0 1 2
 
 Each trial is a change of ``compact`` with its smaller sizes before 2026-11-27, trained on a quarter of the view of
-nuScenes' HDL-32E (32 x 272 pixels) with one sweep, and one round except in "second round marks objects": 4,000
-frames of varied simulated streets, 3,000 steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on
-200 unseen frames, and on 60 of them after each quarter of the training. A second look (``refinement``) is trained
-in the same step ("joint"), or afterwards on the same frames ("looked at again"), with the first trial's weights
-frozen and boxes that were found once: by 3,000 updates of four frames, or, after "local geometry", by 24,000 of
-one of 2,000 frames. The seconds per step of the latter are its whole time without the detector's training, divided
-by the steps. Only "neighbours" and "local geometry, looked at again" compare each box with its neighbours, as
-``compact`` does.
+nuScenes' HDL-32E (32 x 272 pixels) with one sweep and one round: 4,000 frames of varied simulated streets, 3,000
+steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on 200 unseen frames, and on 60 of them
+after each quarter of the training. A second look (``refinement``) is trained in the same step ("joint"), or
+afterwards on the same frames ("looked at again"), with the first trial's weights frozen and boxes that were found
+once: by 3,000 updates of four frames, or, after "local geometry", by 24,000 of one of 2,000 frames. The seconds
+per step of the latter are its whole time without the detector's training, divided by the steps. Only "neighbours"
+and "local geometry, looked at again" compare each box with its neighbours, as ``compact`` does.
 
 The same command resumes a trial, except for the updates of a second look afterwards. Trials that are already in
 the file of ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the
@@ -30,8 +28,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from experiments.cached import CachedFrames
 from experiments.changes import LARGER, LONE_LOOK, QUARTER_LOOK, SLIM, Change, change
 from experiments.hardware import hardware
@@ -43,13 +39,11 @@ from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
-from fcos_lidar_jax.data.box_geometry import points_in_boxes
-from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFrames
-from fcos_lidar_jax.files import checksum, read_json
+from fcos_lidar_jax.data.frame import SelectedFrames
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, NUSCENES
-from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.streets import CITY
@@ -59,8 +53,6 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
 DISTANCES_M = ("0.5", "1.0", "2.0", "4.0")
-_BEHIND_M = 1.0  # Distance of a mark from the object's point.
-_STEP = 8192  # Clouds are padded to its multiples, so that few sizes are compiled.
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
 
 BASE: Change = change(
@@ -75,7 +67,6 @@ BASE: Change = change(
     augment__flip_y_probability=0.0,
     augment__max_rotation_rad=math.radians(5),
 )
-MARKED = "second round marks objects"
 _SMALL = "local geometry, joint, neighbours"
 
 
@@ -107,7 +98,6 @@ TRIALS: dict[str, Change] = {
     "local geometry": change(),
     "larger": change(**LARGER),
     "larger, without local geometry": change(**LARGER, model__local_geometry=False),
-    MARKED: change(**LARGER, projection__num_rounds=2),
     "local geometry, joint": change(refinement=LONE_LOOK),
     _SMALL: change(refinement=QUARTER_LOOK),
     "larger, joint": change(**LARGER, refinement=LONE_LOOK),
@@ -126,45 +116,6 @@ class Args(Options):
     work: Path = Path("outputs/ladder")  # Folder of frames and runs.
 
 
-@dataclasses.dataclass(frozen=True)
-class FirstRound(WrappedFrames):
-    """Frames reduced to the points that the first round keeps, in their order; the annotations stay."""
-
-    frames: FrameSet
-
-    def frame(self, index: int) -> Frame:
-        frame = self.frames.frame(index)
-        number = len(frame.points)
-        points = np.pad(frame.points, ((0, -number % _STEP), (0, 0)))
-        valid = np.arange(len(points)) < number
-        image = project_points(points, valid, self.sensor, num_rounds=1, prioritize_current=False)
-        kept = np.unique(image.point_index)
-        return dataclasses.replace(frame, points=frame.points[kept[kept >= 0]])
-
-    def fingerprint(self) -> str:
-        return checksum(repr((self.frames.fingerprint(), "first round", False)).encode())
-
-
-@dataclasses.dataclass(frozen=True)
-class Marked(WrappedFrames):
-    """Frames whose first round is the cloud's, and whose second round has a point only where there is an object.
-
-    It is 1 m behind the object's point. A network that can use a second round scores higher with it.
-    """
-
-    frames: FrameSet
-
-    def frame(self, index: int) -> Frame:
-        frame = FirstRound(self.frames).frame(index)
-        inside = points_in_boxes(frame.points, frame.boxes)
-        marks = frame.points[np.unique(np.concatenate([np.zeros(0, int), *inside]))]
-        marks[:, :3] *= 1 + _BEHIND_M / np.linalg.norm(marks[:, :3], axis=1, keepdims=True)
-        return dataclasses.replace(frame, points=np.concatenate([frame.points, marks]))
-
-    def fingerprint(self) -> str:
-        return checksum(repr((self.frames.fingerprint(), "marked")).encode())
-
-
 def frames(work: Path, split: str) -> CachedFrames:
     """Open the frames of a split, which are simulated once."""
     number, first = {"train": (TRAIN_FRAMES, 0), "test": (TEST_FRAMES, UNSEEN_SEED)}[split]
@@ -181,8 +132,6 @@ def run_folder(name: str, seed: int, args: Args) -> Path:
 def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     """Train a trial and score it."""
     seen, tests = (frames(args.work, split) for split in ("train", "test"))
-    if name == MARKED:
-        seen, tests = Marked(seen), Marked(tests)
     curve_frames = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
     folder = run_folder(name, seed, args)
     if name in AFTERWARDS:

@@ -25,13 +25,8 @@ once per frame and kept in the folder of the run, a megabyte per frame; each fra
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/second_look --warm-start hdl32e \
         --second-look --seed 4 --steps 38400
 
-``--average CHECKPOINT`` exports the average with the weights of an earlier training, such as those that this one
-started from: a training on other streets loses some of what the earlier one had learned. The logits
-of weights in the package are adjusted already; those of a run's checkpoints are not.
-
 With ``--simulators``, that many processes simulate streets, from ``seed * 100,000`` on, and the steps repeat the
-streets that there are. Such a run resumes, but not bit for bit. It does not pause for evaluations; ``--export``
-scores its checkpoints instead.
+streets that there are. Such a run resumes, but not bit for bit, and does not pause for evaluations.
 
 Cost: half a second to three seconds per step on two CPU cores, so hours in total; 13,429 steps of four
 frames took 568 s on an H200. Expected: an mAP of at least 0.6 for quickstart.
@@ -58,7 +53,7 @@ from experiments.second_look import USES, look_again, look_config
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
-from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config
@@ -115,13 +110,11 @@ _MATT_PERIOD = 3
 """Every third street has matt cars, like the simulated drives of the tests. With ``--simulators`` it is about
 every third, since each process simulates streets of one kind, and some are faster."""
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
-_AVERAGE_SHARE = 0.3  # Share of the earlier weights in an average.
 _NICE = 10
 _CURVE_FRAMES = 40  # Unseen frames of evaluations during training.
 _STREETS, _POOLED = "streets", "pool.json"  # Folder and record of repeated streets, in the folder of the run.
 _LOOK = "second_look.json"  # Record of a second look.
 _POOL = 100_000  # Streets to simulate at most, if they repeat.
-_KEPT = 50  # Checkpoints of a run without evaluations.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -140,7 +133,6 @@ class Args(Options):
     second_look: bool = False  # Train only the second look, with the detector of --warm-start frozen.
     save_every: int = 150  # Steps between two checkpoints.
     export: bool = False  # Write the current weights into the package instead of training.
-    average: Path | None = None  # Checkpoint of an earlier training to average the exported weights with.
     test_frames: int = 200  # Unseen frames for the scores.
 
 
@@ -200,7 +192,7 @@ def train(args: Args, work: Path) -> dict[str, Any]:
         trained(work, config, frames, **run, tests=curve_frames, schedule=schedule)
         return training_record(work)
     pool = CachedFrames(frames, work / _STREETS)
-    schedule = Schedule(save_every=args.save_every, keep=_KEPT)
+    schedule = Schedule(save_every=args.save_every)
     with simulating(pool, args.simulators):
         trained(work, config, PooledFrames(pool), **run, schedule=schedule)
     record = {"streets": len(pool.made()), "device": hardware()["device"]}
@@ -227,23 +219,12 @@ def train_second_look(args: Args, work: Path, config: Config) -> dict[str, Any]:
         "steps": args.steps,
         "frames_seen": len(frames),
         "seconds": round(time.monotonic() - began),
-        "curve": [],
         "trained": "second look",
         "num_boxes": config.refinement.num_boxes,
         "num_points": config.refinement.num_points,
     }
     write_text(work / _LOOK, compact_json(record) + "\n")
     return record
-
-
-def curve_of(work: Path) -> list[list[float]]:
-    """Score the checkpoints of a run that did not pause for evaluations."""
-    curve = []
-    for path in Checkpoints(work / CHECKPOINTS).paths():
-        detector = load_trained(path)
-        score = evaluated(detector, _CURVE_FRAMES).summary["mean_ap"]
-        curve.append([load_checkpoint(path).step * detector.config.optimizer.batch_size, round(score, 4)])
-    return curve
 
 
 def evaluated(detector: TrainedDetector, number: int) -> Evaluation:
@@ -284,22 +265,6 @@ def earlier_trainings(name: str, training: Mapping[str, Any], results: Path) -> 
     if "training" not in before:
         raise ValueError(f"{file}: training: missing, expected that of the weights that this one started from")
     return [t for t in (*before["earlier"], before["training"]) if t["seed"] != training["seed"]]
-
-
-def averaged(checkpoint: Checkpoint, other: Checkpoint) -> Checkpoint:
-    """Average the weights of two checkpoints, with a smaller share of the other one.
-
-    After training on other streets, the average of old and new weights is often better on both (Wortsman et al.,
-    "Robust fine-tuning of zero-shot models", CVPR 2022). The second training must start from the first one.
-    """
-    shapes, others = (jax.tree.map(np.shape, c.variables) for c in (checkpoint, other))
-    if shapes != others:
-        raise ValueError("--average: got another network, expected that of --work")
-
-    def mean(own: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return (1 - _AVERAGE_SHARE) * np.asarray(own, np.float32) + _AVERAGE_SHARE * np.asarray(others, np.float32)
-
-    return dataclasses.replace(checkpoint, variables=jax.tree.map(mean, checkpoint.variables, other.variables))
 
 
 def with_adjusted_logits(checkpoint: Checkpoint, share: float) -> Checkpoint:
@@ -348,17 +313,12 @@ def scores(args: Args) -> dict[str, Any]:
 def export(args: Args, work: Path) -> dict[str, Any]:
     """Write the weights of the newest checkpoint and their model card; returns training and scores."""
     folder, training = SHIPPED / args.name, training_record(work)
-    training["curve"] = training["curve"] or curve_of(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     share = _LOGIT_ADJUSTMENT.get(args.name)
     if share and "trained" not in training:  # The logits of a frozen detector are adjusted already.
         checkpoint = with_adjusted_logits(checkpoint, share)
         training["logit_adjustment"] = share
-    if args.average is not None:
-        other = find_checkpoint(args.average)
-        checkpoint = averaged(checkpoint, load_checkpoint(other))
-        training["averaged_with"] = {"hash": read_description(other)["hash"], "share": _AVERAGE_SHARE}
     halved = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), checkpoint.variables)
     save_checkpoint(folder, dataclasses.replace(checkpoint, variables=halved))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -11,17 +11,10 @@ from linear_network import linear_network
 from experiments.changes import LONE_LOOK, SLIM, change
 from experiments.ledger import RESULTS
 from experiments.studies import ladder
-from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, Marked, measure
+from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, measure
 from fcos_lidar_jax.checkpoints import load_checkpoint
-from fcos_lidar_jax.data.box_geometry import inside_box
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import COMPACT
-from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.sensors import TINY
-from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.types import CHANNELS
-
-RANGE = CHANNELS.index("range")
 
 COMMITTED = {row["trial"]: row["parameters"] for row in json.loads((RESULTS / "ladder.json").read_text())["rows"]}
 
@@ -63,24 +56,3 @@ def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(ladder, "trial", None)  # nothing is trained again
     measure(args)
     assert capsys.readouterr().out.count("| larger | 2 |") == 2  # in both tables
-
-
-@pytest.mark.slow
-def test_the_second_round_marks_the_objects_and_the_first_stays():
-    made = SimulatedFrames(TINY, 1)
-    frame, marked = made.frame(0), Marked(made).frame(0)
-    before, after = (
-        project_points(f.points, np.ones(len(f.points), bool), TINY, num_rounds=2, prioritize_current=False)
-        for f in (frame, marked)
-    )
-    np.testing.assert_array_equal(after.features[..., 0], before.features[..., 0])
-    filled = after.point_index[..., 1] >= 0
-    inside = np.zeros(filled.shape, bool)
-    for place in np.argwhere(after.point_index[..., 0] >= 0):
-        point = marked.points[after.point_index[(*place, 0)]]
-        inside[tuple(place)] = any(inside_box(point[None], box)[0] for box in frame.boxes)
-    assert (filled != inside).sum() <= 2  # Marks on the border of their pixel may round into the next.
-    assert 0.1 < inside.mean() < 0.9
-    apart = after.features[..., RANGE, 1] - after.features[..., RANGE, 0]
-    np.testing.assert_allclose(apart[filled], 1, atol=1e-4)
-    np.testing.assert_array_equal(marked.boxes, frame.boxes)
