@@ -68,6 +68,7 @@ def test_other_post_processing_stays_in_openvino_and_flips_are_refused(trained, 
     fewer, points = fast.with_inference(max_detections=3), make_frame(0, SENSOR).points
     assert (type(fewer), fewer.fingerprint) == (type(fast), fast.fingerprint)
     np.testing.assert_array_equal(fewer(points).scores, fast(points).scores[:3])
+    assert type(fast.without_second_look()) is type(fast)
     flippable = build_detector(dataclasses.replace(REFINED, augment=AugmentConfig()), SENSOR)
     with pytest.raises(ValueError, match=r"^backend openvino: found inference\.flips x, expected none$"):
         dataclasses.replace(fast, model=flippable).with_inference(flips="x")

@@ -24,7 +24,7 @@ import pytest
 from event_files import summaries
 from linear_network import linear_network
 from PIL import Image
-from tiny_run import CONFIG, FRAMES, SENSOR, STEPS, TESTS, bits, train_tiny, weights
+from tiny_run import CONFIG, FRAMES, LOOK, REFINED, SENSOR, STEPS, TESTS, bits, train_tiny, weights
 
 from fcos_lidar_jax.checkpoints import load_checkpoint, load_state
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -536,6 +536,7 @@ def rings(frame: Frame) -> Frame:
 
 PARTIAL = PartialFrames(tuple(GIVEN[:2]), FRAMES.sensor, FRAMES.classes)
 UNREADABLE = UnreadableFrames((GIVEN[0],), FRAMES.sensor, FRAMES.classes)
+FROZEN = dataclasses.replace(REFINED, refinement=dataclasses.replace(LOOK, freeze_detector=True))
 OTHER_NETWORK = {"params": {"kernel": np.ones(3)}, "batch_stats": {}}
 
 
@@ -545,6 +546,7 @@ OTHER_NETWORK = {"params": {"kernel": np.ones(3)}, "batch_stats": {}}
         ({"steps": 2.5}, "steps: got 2.5, expected an integer from 1 to 2147483647"),
         ({"seed": 2**32}, "seed: got 4294967296, expected an integer from 0 to 4294967295"),
         ({"config": dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())}, "copy_paste: got no ground-truth"),
+        ({"config": FROZEN}, "refinement.freeze_detector: got True, expected False without weights of a detector"),
         ({"frames": "my_lidar"}, "frames: got 'str', expected a set of frames, as open_frames returns"),
         ({"threads": -1}, "threads: got -1, expected at least 0"),
         ({"frames": UNREADABLE}, "clouds/0.npy: empty file"),
