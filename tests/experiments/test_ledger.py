@@ -80,6 +80,7 @@ def test_verdicts(gains, paper, expected):
 def test_an_undecided_claim_names_the_seeds_that_would_decide():
     # Deviation 1: t(0.975, 5) / sqrt(6) = 1.049, t(0.975, 6) / sqrt(7) = 0.925.
     assert verdict([-0.5, 0.5, 1.5], 1.0)[1].startswith("7 seeds")
+    assert verdict([0.5, -0.5, -1.5], -1.0)[1].startswith("7 seeds")
     assert verdict([-9.0, 0.5, 9.0], 0.01)[1].startswith("over 100 seeds")
 
 

@@ -2,17 +2,12 @@
 
 import dataclasses
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import oracles
 import pytest
-from commands import child_environment, contents
+from commands import contents
 from refusal import refused
 from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
@@ -206,53 +201,6 @@ def test_an_interrupted_build_has_no_manifest_and_resumes_to_the_same_bytes(
     assert reports[0] >= done
     if not over_an_older_one:
         assert before.items() <= stamps(tmp_path).items()  # finished shards are not written again
-
-
-def ends(group):
-    """Wait up to 10 s until a process group is gone; return whether it is."""
-    for _ in range(200):
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.05)
-    return False
-
-
-KILLED = """
-import sys
-from fcos_lidar_jax.input_pipeline.database import prepare_database
-from toy_frames import SceneFrames, ToyFrames
-if __name__ == "__main__":
-    scenes = tuple((f"scene-{i}", (i, i + 1)) for i in range(24))
-    prepare_database(SceneFrames(ToyFrames(25, 0.03), scenes), sys.argv[1], workers=2)
-"""
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_the_workers_and_the_build_resumes_to_the_same_bytes(tmp_path):
-    script = tmp_path / "build.py"
-    script.write_text(KILLED)
-    folder = tmp_path / "objects"
-    process = subprocess.Popen(
-        [sys.executable, script, folder],
-        env=child_environment(),
-        start_new_session=True,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 60
-    while len(list(folder.glob("*.npz"))) < 4 and time.monotonic() < deadline:
-        time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGINT)  # like a terminal, to the whole process group
-    error = process.communicate(timeout=60)[1]
-    assert 4 <= len(list(folder.glob("*.npz"))) < 24
-    assert not (folder / "manifest.json").exists()
-    assert error.count("Traceback") <= 1  # the workers print nothing
-    assert ends(process.pid)
-    for each in (folder, tmp_path / "whole"):
-        build(each, ToyFrames(25), scenes=tuple((f"scene-{i}", (i, i + 1)) for i in range(24)))
-    assert contents(folder) == contents(tmp_path / "whole")
 
 
 def test_a_build_from_other_data_replaces_the_old_shards(tmp_path):

@@ -2,11 +2,6 @@
 
 import dataclasses
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -163,22 +158,6 @@ def test_killed_runs_resume_to_the_same_bytes(tmp_path):
             assert contents(root / VERSION) == contents(whole / VERSION)
         assert contents(synthesize(root, *quick)) == contents(whole)
     assert len(states) >= 4  # kills at different stages
-
-
-@pytest.mark.slow
-def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, tmp_path):
-    root = tmp_path / "data"
-    started = [sys.executable, "-m", "fcos_lidar_jax", *command(root, "--workers", "2")]
-    with subprocess.Popen(started, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        until = time.monotonic() + 60
-        while not list(root.rglob("*.bin")) and time.monotonic() < until:
-            time.sleep(0.02)
-        os.kill(process.pid, signal.SIGKILL)
-    time.sleep(0.5)
-    before = contents(root)
-    time.sleep(0.5)
-    assert contents(root) == before  # no process writes any more
-    assert contents(synthesize(root)) == contents(made)
 
 
 @pytest.mark.parametrize(
