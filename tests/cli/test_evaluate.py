@@ -124,7 +124,7 @@ def leaves(value):
 
 @pytest.mark.slow
 def test_a_checkpoint_is_evaluated_and_larger_batches_change_boxes_only_by_rounding(home, tmp_path, capsys):
-    """tests/cli/test_faults.py resumes an evaluation that was killed."""
+    """tests/cli/test_processes.py resumes an evaluation."""
     options = {"checkpoint": home / "checkpoint", **place(home), "report": False}
     run(Evaluate(out=tmp_path / "single", **options))
     assert "frames 6/6" in capsys.readouterr().err
