@@ -193,10 +193,7 @@ def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, 
 
 
 BAD = mistakes(r"""
---steps 0 => steps: got 0, expected an integer from 1 to 2147483647
 --keep 0 => keep: got 0
---samples 0:1 --threads -1 => threads: got -1
---data-root gone => gone: no such folder, expected a data set
 --version v9 => v9: no such folder
 --train-split other => split 'other': not found
 --val-split other => split 'other': not found
@@ -207,13 +204,10 @@ BAD = mistakes(r"""
 --val-samples 2:2 => --val-samples: got '2:2', expected
 --resume => run.json: found nothing, expected the run to resume
 --weights gone => gone: found nothing, expected a checkpoint folder
---weights HOME/start --model.fpn-channels 16 => start: params/.*: got \(.*8.*\), expected \(.*16.*\): the arrays
 --val-split none --evaluate-every 4 => --evaluate-every: got 4 with --val-split none, which turns evaluation off
 --val-split none --val-samples 0:1 => --val-samples: got '0:1' with --val-split none, which turns evaluation off
---copy-paste.min-points 3 => copy_paste.min_points: got 3, expected at least the database's 5
 --optimizer.accumulate 3 => --optimizer.accumulate: got 3, expected a divisor of the batch size 2$
 --model.stem.channels-per-type 0 => --model.stem.channels-per-type: got 0, expected at least 1$
---sensor sonar => sonar: no such sensor
 --num-sweeps 2 => num_sweeps: got 2, expected at most the 1 of .*/train: run fcos-lidar prepare --num-sweeps 2$
 --train-split val => objects/val: no objects here, .* prepare --train-split val
 """)
