@@ -121,6 +121,7 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: Config(class_ranges_m=(50.0,)),
         lambda: Config(copy_paste=CopyPasteConfig(targets=(2, 2))).paste_targets,
         lambda: Config(augment=None, inference=InferenceConfig(flips="x")),
+        lambda: Config(augment=AugmentConfig(flip_y_probability=0.0), inference=InferenceConfig(flips="xy")),
     ],
 )
 def test_nonsense_is_refused_at_construction(make):

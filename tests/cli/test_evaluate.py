@@ -169,18 +169,6 @@ def test_an_earlier_report_is_removed(home, by_tables, tmp_path):
     assert list(mine.parent.iterdir()) == [mine]
 
 
-def test_explains_empty_truth_and_empty_results(home, tmp_path, capsys):
-    results, truth = read(home / "results.json"), read(home / "truth.json")
-    truth = {token: {**sample, "boxes": []} for token, sample in truth.items()}
-    results["results"] = {token: [] for token in truth}
-    by_files(tmp_path, results, truth, bootstrap=3)
-    errors = capsys.readouterr().err
-    assert "no ground truth is evaluated:" in errors
-    assert "the results contain no boxes" in errors
-    assert read(tmp_path / "out" / "metrics_summary.json")["nd_score"] == 0
-    assert (tmp_path / "out" / "report.html").is_file()
-
-
 def test_with_a_class_map_the_metric_is_not_the_official_one(home, tmp_path):
     (tmp_path / "map.json").write_text(json.dumps(dict.fromkeys(NUSCENES_CLASSES[1:], None)))
     data = dataclasses.replace(place(home)["data"], class_map=str(tmp_path / "map.json"))

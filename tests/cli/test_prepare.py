@@ -6,7 +6,6 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 from commands import assert_one_line_error, command, contents, in_use, run_python
 from kills import killed_twice
@@ -93,22 +92,6 @@ def test_an_index_of_changed_tables_is_rebuilt_with_a_message(root, tmp_path, ca
     assert contents(tmp_path / "i") == contents(tmp_path / "new")
 
 
-def test_clouds_without_usable_points_are_reported_once_and_no_others_refused(root, tmp_path, capsys):
-    copy = shutil.copytree(root, tmp_path / "copy")
-
-    def place_all_points(scene, x):
-        for file in copy.glob(f"s*/*/{scene}-*"):
-            np.array([[x, 9, 0, 9, 0]], np.float32).tofile(file)
-
-    place_all_points("*", 9)
-    place_all_points("0", 1e4)
-    command(*prepare(copy, tmp_path / "i"))
-    note = "note: 4 of 24 clouds without usable points, and so without objects: the first is "
-    assert capsys.readouterr().err.count(note) == 1
-    place_all_points("*", 1e4)
-    assert_one_line_error(capsys, prepare(copy, tmp_path / "i"), "points is usable")
-
-
 def test_an_invalid_index_is_rebuilt_with_a_message(root, tmp_path, capsys):
     command(*prepare(root, tmp_path / "i"))
     before = contents(tmp_path / "i")
@@ -118,22 +101,6 @@ def test_an_invalid_index_is_rebuilt_with_a_message(root, tmp_path, capsys):
     line = next(line for line in capsys.readouterr().err.splitlines() if "index.json: not JSON" in line)
     assert line.endswith(": rebuilding it")
     assert contents(tmp_path / "i") == before
-
-
-@pytest.mark.parametrize(
-    ("splits", "more", "expected"),
-    [
-        (None, "--train-split other", "split 'other': not found in"),
-        ({"train": ["scene-99"]}, "--train-split train", "split 'train': scene-99: no such scene in"),
-    ],
-)
-def test_a_wrong_split_is_refused_before_the_index_is_made(root, tmp_path, capsys, splits, more, expected):
-    copy = shutil.copytree(root, tmp_path / "copy")
-    (copy / VERSION / "splits.json").unlink()
-    if splits is not None:
-        (copy / VERSION / "splits.json").write_text(json.dumps(splits))
-    assert_one_line_error(capsys, prepare(copy, tmp_path / "i", *more.split()), expected)
-    assert not (tmp_path / "i").exists()
 
 
 def test_the_folder_is_told_before_it_is_written_and_asked_for_otherwise(root, tmp_path, monkeypatch, capsys):

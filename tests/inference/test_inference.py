@@ -200,11 +200,3 @@ def test_detections_with_flips_are_equivariant_to_mirrored_clouds(detector):
     difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
     # Boxes with nearly equal scores may change places.
     assert (np.abs(difference).max(axis=1) < 1e-3).mean() > 0.9
-
-
-@pytest.mark.parametrize(("augment", "axis"), [(AugmentConfig(flip_y_probability=0.0), "y"), (None, "x")])
-def test_flips_without_the_same_augmentation_are_refused(augment, axis):
-    inference = dataclasses.replace(CONFIG.inference, flips="xy")
-    message = rf"inference.flips: got 'xy', expected augment.flip_{axis}_probability above 0"
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(CONFIG, augment=augment, inference=inference)

@@ -28,7 +28,6 @@ from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import NonFiniteLossError, fit, make_optimizer, make_state, make_train_step, plan
-from fcos_lidar_jax.training.optimizer import learning_rate_schedule, momentum_schedule
 from fcos_lidar_jax.training.step import detection_variables, make_gradient
 from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums, TrainState
 
@@ -158,15 +157,6 @@ def test_the_owner_of_a_location_is_the_owner_of_its_first_round_point():
     expected = [oracles.owner(scene.points[row, :3], boxes, box_valid) if row >= 0 else -1 for row in rows]
     np.testing.assert_array_equal(owner[sample], expected)
     assert sum(box >= 0 for box in expected) > 10
-
-
-def test_schedules_have_the_end_points_of_the_paper():
-    rate, momentum = (f(OptimizerConfig(), 5000) for f in (learning_rate_schedule, momentum_schedule))
-    np.testing.assert_allclose([rate(0), rate(2000), rate(5000)], [1e-3, 1e-2, 1e-7], rtol=1e-4)
-    np.testing.assert_allclose([momentum(0), momentum(2000), momentum(5000)], [0.95, 0.85, 0.95], rtol=1e-5)
-    # A cosine is at its mean in the middle of the warm-up.
-    np.testing.assert_allclose(rate(1000), (1e-3 + 1e-2) / 2, rtol=1e-4)
-    np.testing.assert_allclose(momentum(1000), 0.9, rtol=1e-5)
 
 
 def test_the_optimizer_clips_decays_and_reports():
