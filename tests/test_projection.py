@@ -13,14 +13,7 @@ from jax import export
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.projection import image_cells, priority_keys, project_points, remove_close, winners
-from fcos_lidar_jax.sensors import (
-    NUSCENES_HDL32E,
-    PRESETS,
-    WAYMO_TOP,
-    Sensor,
-    even_inclinations,
-    sector,
-)
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, PRESETS, WAYMO_TOP, Sensor, even_inclinations, sector
 
 pytestmark = pytest.mark.optimised
 
@@ -79,11 +72,7 @@ def reference_cells(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.
     return np.where(good, row * sensor.num_columns + np.floor(u).astype(int) % sensor.num_columns, cells), edge
 
 
-@pytest.mark.parametrize(
-    "sensor",
-    [SMALL, LASER, AHEAD, BEHIND, *PRESETS.values()],
-    ids=lambda s: s.name,
-)
+@pytest.mark.parametrize("sensor", [SMALL, LASER, AHEAD, BEHIND, *PRESETS.values()], ids=lambda s: s.name)
 def test_cells_match_their_definition(sensor):
     points = cloud(0, 5000, sensor.point_columns)
     cells, (range_m, azimuth, inclination) = cells_of(points, sensor)

@@ -139,10 +139,7 @@ BAD = [
     ({**BEAMLESS, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 2**32}}, "rows: got 4294967296"),
     ({**BEAMLESS, "inclinations_deg": {"lowest": 5, "highest": -5, "rows": 2}}, "inclinations_rad: .* decreasing"),
     ({**BEAMLESS, "inclinations_deg": [1, "2"]}, r"inclinations_deg\[1\]: got '2', expected float"),
-    (
-        {**GOOD, "azimuth_limits_rad": [1]},
-        "azimuth_limits_rad: got .*, expected a tuple of 2 float or None",
-    ),
+    ({**GOOD, "azimuth_limits_rad": [1]}, "azimuth_limits_rad: got .*, expected a tuple of 2 float or None"),
     ({**GOOD, "azimuth_limits_rad": [1, 1]}, r"azimuth_limits_rad: got \(1\.0, 1\.0\), expected \(right, left\)"),
     ({**GOOD, "azimuth_limits_rad": [-3, 4]}, r"azimuth_limits_rad: got \(-3\.0, 4\.0\), expected \(right, "),
     ({**GOOD, "limit_xy_m": 1e31}, "limit_xy_m: got 1e"),

@@ -13,13 +13,7 @@ import numpy as np
 import pytest
 from tiny_run import CONFIG, SENSOR, bits
 
-from fcos_lidar_jax.checkpoints import (
-    Checkpoint,
-    CheckpointError,
-    load_checkpoint,
-    load_state,
-    save_checkpoint,
-)
+from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, load_state, save_checkpoint
 from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.models import build_detector

@@ -38,10 +38,7 @@ def fail_with(error):
         (RecursionError("maximum recursion depth"), "nested too deeply: expected a file or an option with fewer"),
         (MemoryError(), "out of memory: for training, --optimizer.accumulate"),
         (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: for training, --optimizer.accumulate"),
-        (
-            RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
-            "another process ended, see its output: UNK",
-        ),
+        (RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"), "another process ended, see its output: UNK"),
         (
             RuntimeError("Gloo context initialization failed: Read error"),
             "the connection between the processes failed: G",

@@ -14,12 +14,7 @@ from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.files import checksum
-from fcos_lidar_jax.input_pipeline.database import (
-    objects_folder,
-    open_database,
-    prepare_database,
-    shards_by_scene,
-)
+from fcos_lidar_jax.input_pipeline.database import objects_folder, open_database, prepare_database, shards_by_scene
 from fcos_lidar_jax.sensors import ARGOVERSE2
 
 SCENES = (("scene-b", (0, 1, 2)), ("scene-a", (3,)), ("scene-c", (6, 4)))
@@ -234,11 +229,7 @@ DAMAGE = {
     "no manifest": (MANIFEST, Path.unlink, "no such file, expected a finished"),
     "truncated manifest": (MANIFEST, lambda f: cut(f, 100), "not JSON"),
     "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 5; rebuild it with"),
-    "path": (
-        MANIFEST,
-        lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]),
-        "name: got '/etc/x', expected",
-    ),
+    "path": (MANIFEST, lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]), "name: got '/etc/x', expected"),
     "few classes": (MANIFEST, lambda f: edit(f, classes=["car"]), "classes: got ['car'], expected at least "),
     "altered table": (TABLE, lambda f: flip(f, 700), "rebuild it with"),
     "truncated table": (TABLE, lambda f: cut(f, 700), "not a table of objects"),

@@ -77,13 +77,7 @@ def alone(objects):
     return batches
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        {"threads": 4, "first_step": 1},
-        {"first_step": STEPS},
-    ],
-)
+@pytest.mark.parametrize("how", [{"threads": 4, "first_step": 1}, {"first_step": STEPS}])
 def test_batches_do_not_depend_on_threads_or_the_first_step(objects, alone, how):
     assert_same(run(config=CONFIG, objects=objects, **how), alone[how.get("first_step", 0) :])
 
@@ -98,8 +92,7 @@ def test_the_rows_of_all_processes_form_the_global_batch(objects, alone):
 
 
 @pytest.mark.parametrize(
-    ("cores", "workers", "threads"),
-    [(1, 0, 1), (2, 0, 2), (3, 0, 2), (128, 0, 16), (32, 4, 4), (4, 16, 1)],
+    ("cores", "workers", "threads"), [(1, 0, 1), (2, 0, 2), (3, 0, 2), (128, 0, 16), (32, 4, 4), (4, 16, 1)]
 )
 def test_the_default_number_of_threads_depends_on_the_cores(monkeypatch, cores, workers, threads):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))

@@ -208,10 +208,7 @@ BAD = {
     "version of kitti": ({"root": "kitti", "version": "v1"}, "version: got v1, expected none"),
     "no such version": ({"root": "nuscenes", "version": "v9"}, "v9: no such folder, expected one of v1.0-made"),
     "full turn": ({"root": "argoverse2", "full_turn": True}, "full_turn: got True, expected none"),
-    "no scale": (
-        {"root": "folder", "intensity_scale": -2.0},
-        "intensity_scale: got -2.0, expected within",
-    ),
+    "no scale": ({"root": "folder", "intensity_scale": -2.0}, "intensity_scale: got -2.0, expected within"),
     "class map": (
         {"root": "kitti", "class_map": {"Lorry": "truck"}},
         "class map: got Lorry, expected classes of the data: Car, Van, ",
