@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, contents, mistakes
+from commands import assert_one_line_error, command, contents, in_use, mistakes
 from made_kitti import calibration_text
 from made_nuscenes import VERSION, make_tables, write
 from tiny_run import TINY_CONFIG, untrained
@@ -40,8 +40,8 @@ def home(tmp_path_factory):
     entry = {"sensor_to_world": np.eye(4).tolist()}
     poses = [{**entry, "file": f"training/velodyne/{i}.npy", "timestamp_us": 50_000 * i} for i in (1, 0)]
     (folder / "poses.json").write_text(json.dumps(poses))
-    (folder / "truth.json").write_text("{}")
-    (folder / "results_nusc.json").write_text("{}")
+    (folder / "truth.json").write_text('{"a": {"ego_translation": [0, 0, 0], "boxes": []}}')
+    (folder / "results_nusc.json").write_text('{"meta": {}, "results": {"a": []}}')
     write(folder / "data", *make_tables(1))
     return folder
 
@@ -74,6 +74,7 @@ detect HOME/good.npy --output-format nuscenes => --output-format nuscenes: found
 detect HOME/good.npy --out HOME/good.npy => --out: .*the same file as .*good.npy
 detect HOME/good.npy --out OUT --page OUT => --page: .*the same file as .*out
 detect HOME/training/velodyne --out HOME/training/velodyne/0.npy => --out: .*found a point file
+detect HOME/good.npy gs://b/run => gs://b/run: got a URL, expected a path: copy
 detect HOME/none.npy --out HOME/link.json => link.json: found a link to .*good
 detect HOME/none.npy --out HOME/good.npy/x => good.npy: found a file, expected a fol
 detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*the place of the checkpoint
@@ -113,16 +114,26 @@ evaluate DATA --checkpoint quickstart --coordinator a:1 --num-processes 2 --proc
 evaluate DATA --distributed --results x => --results: got x, expected none with --distributed: nothing is detected
 evaluate DATA --distributed --checkpoint quickstart --backend openvino => --backend: got openvino, expected none
 evaluate --format simulated --checkpoint HOME/checkpoint --version v1 => version: got v1, expected none
+train quickstart --format simulated --out gs://b/run => gs://b/run: got a URL, expected a path: copy
+train quickstart --data-root gs://b/run => gs://b/run: got a URL, expected a path: copy
+train quickstart --format simulated => all 100000 frames .* --no-class-balanced --no-copy-paste, or at most
+train quickstart --format simulated --no-copy-paste => all 100000 frames .* --no-class-balanced, or at most 2000
+train quickstart DATA --train-split all --val-split none => made: no index here, .* run fcos-lidar prepare$
 train quickstart --data-root HOME/none => none: no such folder
 train quickstart --format simulated --num-processes 2 => --num-processes: got 2, expected only with --process-index
 prepare DATA --train-split other --index OUT => split 'other': not found
 prepare --format simulated --index OUT => simulated frames need no preparation
 prepare DATA --index OUT --workers 0 => --workers: got 0, expected at least 1
+project HOME/good.npy --sensor gs://b/run => gs://b/run: got a URL, expected a path: copy
 project HOME/good.npy --rounds 100000 => --rounds: got 100000, expected within \[1, 100\]$
 project HOME/away.npy => away.npy: none of its
 project HOME/good.npy --png HOME/good.npy => --png: .*the same file as
 synthesize --scenes 1 --sensor argoverse2 => --sensor: got argoverse2, whose rows come from laser numbers
+synthesize --scenes 0 => --scenes: got 0, expected at least 1
+synthesize --scenes 1 --seed -1 => --seed: got -1, expected at least 0
+synthesize --scenes 1 --version samples => --version: got 'samples', expected a name for the folder of the tables
 synthesize --scenes 1 --version ../a => --version: got '../a', expected a name for the folder of the tables
+export --checkpoint gs://b/run => gs://b/run: got a URL, expected a path: copy
 export --checkpoint HOME/checkpoint --out HOME => found a folder
 export --checkpoint HOME/checkpoint --out HOME/checkpoint/a => the place of the checkpoint
 export --checkpoint HOME/detector.fcos => found a file, expected a checkpoint folder
@@ -133,12 +144,14 @@ benchmark --checkpoint HOME/detector.fcos --batch 2 => batch size: got 2
 benchmark --checkpoint HOME/detector.fcos --backend openvino => found an exported program
 benchmark --checkpoint HOME/detector.fcos --out HOME/detector.fcos => the place of the checkpoint
 demo --keyframes 0 => --keyframes: got 0
+demo --out gs:/b/run => gs://b/run: got a URL, expected a path: copy
 demo --out HOME/good.npy => --out: .*: found a file
 """)
 
 
 @pytest.mark.parametrize(("line", "message"), BAD)
-def test_a_bad_input_gets_one_line_and_leaves_nothing(home, tmp_path, capsys, line, message):
+def test_a_bad_input_gets_one_line_and_leaves_nothing(home, tmp_path, monkeypatch, capsys, line, message):
+    monkeypatch.chdir(tmp_path)
     line += "" if any(word in line for word in ("OUT", "--out ", "--index ")) else " --out OUT"
     own = line.split()[0] in ("detect", "stream") and "--checkpoint" not in line
     line += " --checkpoint HOME/checkpoint" if own else ""
@@ -149,6 +162,21 @@ def test_a_bad_input_gets_one_line_and_leaves_nothing(home, tmp_path, capsys, li
     assert_one_line_error(capsys, args, message)
     assert [*tmp_path.iterdir()] == []
     assert contents(home) == before
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"prepare --data-root HOME/data --version {VERSION} --train-split all --index",
+        f"evaluate --data-root HOME/data --version {VERSION} --split all --checkpoint HOME/checkpoint --out",
+        "evaluate --results HOME/results_nusc.json --ground-truth HOME/truth.json --out",
+    ],
+)
+def test_a_folder_in_use_is_left_alone(home, tmp_path, capsys, line):
+    with in_use(tmp_path):
+        words = [*line.replace("HOME", str(home)).split(), str(tmp_path)]
+        assert_one_line_error(capsys, words, "in use: process .* is at work")
+        assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize("line", ["detect HOME/good.npy", "stream HOME/good.npy", "evaluate --format simulated"])

@@ -9,7 +9,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from commands import in_use, page_content
+from commands import page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
@@ -192,11 +192,3 @@ def test_results_need_only_the_tables(home, by_tables, tmp_path, capsys):
     summary, expected = (read(folder / "metrics_summary.json") for folder in (tmp_path / "out", by_tables))
     assert summary["mean_ap"] == expected["mean_ap"] > 0
     assert "M?nchen" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("what", ["checkpoint", "results"])
-def test_a_folder_in_use_is_left_alone(home, tmp_path, what):
-    given = {what: home / {"checkpoint": "checkpoint", "results": "results.json"}[what]}
-    with in_use(tmp_path), pytest.raises(BlockingIOError, match="in use: process "):
-        run(Evaluate(out=tmp_path, **given, **place(home)))
-    assert [path.name for path in tmp_path.iterdir()] == [".lock"]

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from commands import assert_one_line_error, command, contents, in_use, run_python
+from commands import assert_one_line_error, command, contents, run_python
 from kills import killed_twice
 from made_nuscenes import VERSION, make_tables, write
 
@@ -54,12 +54,6 @@ def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
         command(*prepare(root, folder, *(["--workers", "2"] if trial == 0 else [])))
         assert contents(folder) == expected
     assert len(states - {(), tuple(expected)}) >= 4  # kills at different stages
-
-
-def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
-    with in_use(tmp_path / "i"):
-        assert_one_line_error(capsys, prepare(root, tmp_path / "i"), "i: in use: process ")
-        assert list(contents(tmp_path / "i")) == [".lock"]
 
 
 def test_objects_come_only_from_the_training_split(root, tmp_path):

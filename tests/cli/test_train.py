@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import hashlib
 import json
-import shutil
 import signal
 import socket
 import time
@@ -220,14 +219,6 @@ def test_mistakes_get_one_line_and_leave_nothing(root, tmp_path, capsys, line, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_rejects_options_that_simulate_all_frames_before_the_first_step(tmp_path, capsys):
-    args = ["train", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out")]
-    message = "all 100000 frames would be made before the first step, expected --no-class-balanced"
-    for more, line in (((), f"{message} --no-copy-paste"), (("--no-copy-paste",), message)):
-        assert_one_line_error(capsys, [*args, *more], f"{line}, or at most 2000 of them by --samples")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_objects_of_more_sweeps_are_taken(root, tmp_path, monkeypatch, capsys):
     where = ["--data-root", root, "--version", VERSION, "--index", tmp_path / "index"]
     command("prepare --num-sweeps 3", *where)
@@ -281,11 +272,3 @@ def test_ctrl_c_while_objects_are_cut_leaves_the_folder_to_the_same_command(root
     capsys.readouterr()
     assert cli.main(args) == 1
     assert int(capsys.readouterr().out) > 0
-
-
-def test_without_prepare_the_error_names_it(root, tmp_path, capsys):
-    copy = shutil.copytree(root, tmp_path / "data", ignore=shutil.ignore_patterns(".fcos_lidar"))
-    shutil.copy(root.parent / "sensor.json", tmp_path)
-    message = "v1.0-synthetic: no index here, expected one: run fcos-lidar prepare$"
-    assert_one_line_error(capsys, train(copy, tmp_path / "out"), message)
-    assert not (tmp_path / "out").exists()

@@ -160,19 +160,6 @@ def test_killed_runs_resume_to_the_same_bytes(tmp_path):
     assert len(states) >= 4  # kills at different stages
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--scenes 0", "--scenes: got 0, expected at least 1"),
-        ("--seed -1", "--seed: got -1, expected at least 0"),
-        ("--version samples", "--version: got 'samples', expected a name for the folder of the tables"),
-    ],
-)
-def test_invalid_options_get_one_line(options, message, tmp_path, capsys):
-    assert message in refusal(capsys, tmp_path / "new", *options.split())
-    assert not (tmp_path / "new").exists()
-
-
 def test_folders_with_other_contents_are_refused(made, tmp_path, capsys):
     before = contents(made)
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
