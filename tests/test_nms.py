@@ -1,7 +1,6 @@
 """Check that both forms of rotated NMS keep the same boxes as a greedy loop with Shapely."""
 
 import functools
-import inspect
 
 import jax
 import jax.numpy as jnp
@@ -130,19 +129,6 @@ def test_exported_programs_use_the_form_of_their_platform():
     assert matrices == [("cuda",), ("tpu",), ("cpu", "cuda")]
     expected = oracles.nms(boxes, scores, valid, np.zeros(70), 0.2, 100)
     assert indices(*programs["cpu", "cuda"].call(boxes, scores, valid)) == expected
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"max_outputs": 0}, "max_outputs: got 0, expected at least 1"),
-        ({"overlap": "BEV"}, "overlap: got 'BEV', expected 'bev' or '3d'"),
-    ],
-)
-def test_wrong_options_are_rejected(options, message):
-    unchecked = inspect.unwrap(rotated_nms)  # without the types that the tests check in signatures
-    with pytest.raises(ValueError, match=f"^{message}$"):
-        unchecked(jnp.zeros((1, 7)), jnp.zeros(1), jnp.ones(1, bool), **OPTIONS | options)
 
 
 def merged_by_loops(boxes, scores, valid, labels, kept, threshold, *, vertical):

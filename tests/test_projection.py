@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import inspect
 
 import jax
 import jax.numpy as jnp
@@ -175,25 +174,6 @@ def test_a_cloud_of_padding_gives_an_empty_image(number):
     assert (np.asarray(image.point_index) == -1).all()
     assert not np.asarray(image.features).any()
     assert int(image.num_dropped) == 0
-
-
-CLOUD, MASK = np.zeros((9, 5), np.float32), np.zeros(9, bool)
-BATCHES = r"points, valid: got shapes .* use jax\.vmap for batches"
-
-
-@pytest.mark.parametrize(
-    ("points", "valid", "sensor", "num_rounds", "message"),
-    [
-        (CLOUD, MASK, SMALL, 0, "num_rounds: got 0, expected at least 1"),
-        (CLOUD, MASK, LASER, 1, "points: got 5 columns, expected 6 for sensor 'laser'"),
-        (CLOUD[None], MASK[None], SMALL, 1, BATCHES),
-        (CLOUD, MASK[1:], SMALL, 1, BATCHES),
-    ],
-)
-def test_wrong_arguments_are_rejected(points, valid, sensor, num_rounds, message):
-    unchecked = inspect.unwrap(project_points)  # without the shapes that the tests check in signatures
-    with pytest.raises(ValueError, match=f"^{message}$"):
-        unchecked(points, valid, sensor, num_rounds=num_rounds)
 
 
 def bits(image):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, child_environment, run_python
+from commands import child_environment, run_python
 from refusal import refused
 
 import fcos_lidar_jax as fcos
@@ -112,14 +112,6 @@ def test_an_unusable_environment_is_one_line(tmp_path):
     assert done.returncode == 1
     assert done.stderr.startswith(f"fcos-lidar: error: JAX_PLATFORMS: got 'cuda', {PLATFORM}")
     assert done.stderr.count("\n") == 1
-
-
-def test_deep_files_are_one_line(tmp_path, capsys):
-    np.save(tmp_path / "a.npy", np.ones((9, 4)))
-    project = ["project", str(tmp_path / "a.npy"), "--out", str(tmp_path / "a.npz")]
-    (tmp_path / "deep.json").write_text("[" * 100_000)
-    deep = str(tmp_path / "deep.json")
-    assert_one_line_error(capsys, [*project, "--sensor", deep], "deep.json: not JSON")
 
 
 TERMINATED = """

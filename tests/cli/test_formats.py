@@ -12,7 +12,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command
+from commands import command
 from linear_network import linear_network
 from made_argoverse2 import make_argoverse2
 from made_folder import make_folder
@@ -115,24 +115,23 @@ def prepare_train_evaluate_and_detect(make, tmp_path, capsys):
     assert {box["label"] for box in record["boxes"]} <= set(classes)
 
 
-def test_a_class_map_by_name_trains_on_the_same_frames_as_its_file(tmp_path, monkeypatch, capsys):
-    data, preset, *_ = argoverse2(tmp_path / "data")
-    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", trained := Mock(side_effect=KeyboardInterrupt))
+def test_a_class_map_by_name_opens_the_same_frames_as_its_file(tmp_path, monkeypatch):
+    argoverse2(tmp_path / "data")
     monkeypatch.chdir(tmp_path)
     Path("map.json").write_text(json.dumps(TO_NUSCENES))
     Path("nuscenes").write_text(json.dumps({"PEDESTRIAN": "car"}))
-    line = f"{preset.replace('argoverse2', 'quickstart', 1)} {data} --no-copy-paste --out run"
-    frames = []
-    for given in ("nuscenes", "map.json", "./nuscenes"):
-        with pytest.raises(AssertionError):  # interrupted
-            command("train", line, "--class-map", given)
-        frames.append(trained.call_args.args[1])
+
+    def opened(class_map):
+        return DataOptions(tmp_path / "data", class_map=class_map).open(QUICKSTART, split="train")
+
+    frames = [opened(given) for given in ("nuscenes", "map.json", "./nuscenes")]
     by_name, by_file, by_own_file = ([f.labels(i).tolist() for i in range(len(f))] for f in frames)
     assert frames[0].fingerprint() == frames[1].fingerprint()
     assert by_name == by_file != by_own_file
     known = "the class maps of format argoverse2: nuscenes$"
-    for given, message in (("", "a class map; "), ("--class-map nuscens", "no such file, expected .* one of ")):
-        assert_one_line_error(capsys, f"train {line} {given}".split(), message + known)
+    for given, message in ((None, "a class map; "), ("nuscens", "no such file, expected .* one of ")):
+        with pytest.raises(ValueError, match=message + known):
+            opened(given)
 
 
 ORDER = "(max_points); older sweeps go first, then random points"

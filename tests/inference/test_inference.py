@@ -126,14 +126,6 @@ def arrays(found):
     return bits((found.boxes, found.scores, found.labels))
 
 
-def test_a_detector_accepts_files(detector, tmp_path):
-    points, file = make_frame(0, SENSOR).points, tmp_path / "cloud.npy"
-    np.save(file, points)
-    found = detector(points)
-    assert len(found) > 0
-    assert arrays(detector(file)) == arrays(detector(str(file))) == arrays(found)
-
-
 @pytest.mark.parametrize("axes", ["lidar", "ray"])
 def test_centres_are_offset_along_the_axes_of_the_configuration(axes):
     """The network predicts the same everywhere: one class, and the centre one metre along the first axis."""
