@@ -5,14 +5,13 @@ import json
 import re
 import shutil
 import signal
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import assert_one_line_error, command, in_use
+from commands import assert_one_line_error, command, free_port, in_use
 from forked import Forked, signal_at
 from linear_network import linear_network, use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
@@ -94,12 +93,6 @@ def root(tmp_path_factory) -> Path:
     with linear_network():
         save_checkpoint(home / "linear", Checkpoint(CONFIG, SENSOR, untrained(CONFIG, SENSOR), 1))
     return home / "data"
-
-
-def free_port() -> str:
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        return str(free.getsockname()[1])
 
 
 def start_two(how: str, *args: list[str], before: tuple[Callable[[], object], ...] = (int, int)) -> list[Forked]:

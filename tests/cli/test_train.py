@@ -5,14 +5,12 @@ import functools
 import hashlib
 import json
 import signal
-import socket
-import time
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, in_use, mistakes
+from commands import assert_one_line_error, command, free_port, in_use, mistakes, wait_until
 from forked import Forked
 from linear_network import linear_network, use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
@@ -105,11 +103,8 @@ def checkpoints(out: Path) -> list[str]:
 
 def wait_for_a_step(process: Forked, out: Path, beyond: int = 0) -> None:
     """Wait until the run has done more steps, or has ended."""
-    until = time.monotonic() + 200
-    while process.poll() is None and time.monotonic() < until:
-        if (out / "metrics.jsonl").exists() and len(read_metrics(out)) > beyond:
-            return
-        time.sleep(0.01)
+    metrics = out / "metrics.jsonl"
+    wait_until(lambda: process.poll() is not None or (metrics.exists() and len(read_metrics(out)) > beyond))
 
 
 def long(root: Path) -> list[str]:
@@ -161,9 +156,7 @@ def compile_for_minutes(begun: Path) -> None:
 def test_a_signal_during_the_compilation_ends_the_run_within_seconds(root, tmp_path):
     begun, out = tmp_path / "begun", tmp_path / "run"
     process = Forked(train(root, out, *long(root)), functools.partial(compile_for_minutes, begun))
-    until = time.monotonic() + 200
-    while not begun.exists() and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.05)
+    wait_until(lambda: process.poll() is not None or begun.exists())
     process.send_signal(signal.SIGINT)
     code, _, errors = process.end(timeout_s=10)
     assert code == 128 + signal.SIGINT, errors
@@ -174,10 +167,7 @@ def test_a_signal_during_the_compilation_ends_the_run_within_seconds(root, tmp_p
 @pytest.mark.slow
 def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, child):
     """tests/cli/test_processes.py compares their steps with a single process."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    cluster = ["--coordinator", f"localhost:{port}", "--num-processes", "2"]
+    cluster = ["--coordinator", f"localhost:{free_port()}", "--num-processes", "2"]
     out = tmp_path / "run"
     both = [child(train(root, out, *long(root), *cluster, "--process-index", str(i))) for i in range(2)]
     wait_for_a_step(both[0], out)

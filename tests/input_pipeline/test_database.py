@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import oracles
 import pytest
-from commands import contents
+from commands import contents, cut, flip
 from refusal import refused
 from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
@@ -205,16 +205,6 @@ def test_a_build_from_other_data_replaces_the_old_shards(tmp_path):
     build(tmp_path / "b", scenes=SCENES[:2], source="new", min_points=9)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     assert len(contents(tmp_path / "a")) == 5
-
-
-def flip(file, position):
-    data = bytearray(file.read_bytes())
-    data[position] ^= 1
-    file.write_bytes(data)
-
-
-def cut(file, size):
-    file.write_bytes(file.read_bytes()[:size])
 
 
 def edit(file, **changes):

@@ -6,14 +6,13 @@ import multiprocessing
 import os
 import shutil
 import signal
-import time
 from pathlib import Path
 
 import jax
 import numpy as np
 import oracles
 import pytest
-from commands import run_python
+from commands import run_python, wait_until
 from refusal import refused
 from toy_frames import ListedFrames, ToyFrames, toy_frame
 
@@ -326,8 +325,4 @@ def test_workers_end_when_the_main_process_is_killed(tmp_path):
     assert done.returncode == -signal.SIGKILL
     left = {int(number) for number in done.stdout.split()}
     assert left
-    deadline = time.monotonic() + 30
-    while left and time.monotonic() < deadline:
-        left = {number for number in left if Path(f"/proc/{number}").exists()}
-        time.sleep(0.05)
-    assert not left
+    wait_until(lambda: not any(Path(f"/proc/{number}").exists() for number in left), 30)

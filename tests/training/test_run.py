@@ -21,6 +21,7 @@ from unittest.mock import Mock
 import jax
 import numpy as np
 import pytest
+from commands import contents, cut
 from event_files import summaries
 from linear_network import linear_network
 from PIL import Image
@@ -86,10 +87,6 @@ def scores(folder: Path) -> dict[int, float]:
 
 def checkpoint_names(folder: Path) -> list[str]:
     return sorted(path.name for path in (folder / "checkpoints").glob("*"))
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_step_is_compiled_once(finished):
@@ -274,8 +271,7 @@ def limits():
 
 
 def cut_description(folder: Path) -> None:
-    newest = folder / "checkpoints" / "00000003" / "checkpoint.json"
-    newest.write_text(newest.read_text()[:-9])
+    cut(folder / "checkpoints" / "00000003" / "checkpoint.json", -9)
 
 
 def half_saved(folder: Path) -> None:
