@@ -470,6 +470,7 @@ GROUPED = dataclasses.replace(
     tiny_peer.CONFIG, pillars=dataclasses.replace(tiny_peer.CONFIG.pillars, groups=(0,) * 5 + (1,) * 5)
 )
 CLASSES = {  # the weights, and the part of the network and its arrays that other classes start anew
+    "the network": (TINY_CONFIG, NUSCENES_CLASSES[::-1], {"heads": 12}),
     "a second look": (TINY_REFINED, ("car",), {"heads": 12, "refinement": 3}),
     "groups of CenterPoint": (GROUPED, NUSCENES_CLASSES[::-1], {"heads": 4}),
 }
@@ -480,7 +481,7 @@ def test_weights_for_other_classes_keep_all_arrays_that_do_not_depend_on_them(ca
     config, classes, anew = CLASSES[case]
     given = weights(config)
     detector = build_detector(dataclasses.replace(config, classes=classes), SENSOR)
-    taken = plan._for_other_classes(Path("start"), config.classes, given, detector)
+    taken = plan._for_other_classes(Path("start"), config.classes, given, detector, 0)
     assert jax.tree.structure(taken) == jax.tree.structure(given)
     pairs = zip(jax.tree.leaves_with_path(given), jax.tree.leaves(taken), strict=True)
     changed = [path[1].key for (path, old), new in pairs if not np.array_equal(old, new)]
