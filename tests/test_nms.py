@@ -187,15 +187,6 @@ def test_merging_does_not_depend_on_unused_slots(slots, monkeypatch):
     assert np.abs(np.asarray(expected) - boxes[kept])[used].max() > 0.05
 
 
-def test_merging_loops_only_on_cpus():
-    boxes, scores, valid, labels = clusters(0, 20)
-    given = boxes, scores, valid, jnp.arange(5), jnp.ones(5, bool)
-    for platform, loops in (("cpu", 2), ("cuda", 0)):
-        merged = jax.jit(lambda *given: merge_boxes(*given, labels=labels, iou_threshold=0.3))
-        program = export.export(merged, platforms=(platform,))(*given)
-        assert program.mlir_module().count("stablehlo.while") == loops
-
-
 @FORMS
 def test_boxes_with_zero_size_or_score_are_unchanged_and_gradients_are_finite(form):
     boxes = np.zeros((4, 9), np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import assert_one_line_error, command, page_content
 from made_argoverse2 import STEP_NS, make_log
-from made_bags import FORMS, structured, write_recording
+from made_bags import structured, write_recording
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
@@ -29,7 +29,7 @@ TIMES_US = [(START_NS + index * STEP) // 1000 for index in range(SWEEPS)]
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A detector of three sweeps, and a drive as a folder with poses in JSON and TUM and as ROS recordings."""
+    """A detector of three sweeps, and a drive as a folder with poses in JSON and TUM and as a ROS recording."""
     folder = tmp_path_factory.mktemp("home")
     config = dataclasses.replace(TINY_CONFIG, num_sweeps=WINDOW)
     save_checkpoint(folder / "checkpoint", Checkpoint(config, TINY, untrained(config, TINY), 7))
@@ -55,14 +55,8 @@ def home(tmp_path_factory):
             yield "/tf", make.transform(stamp, "odom", "lidar", place, turn)
             yield "/points", make.cloud(stamp, structured(cloud))
 
-    for form in FORMS:
-        write_recording(folder / form.replace(" ", "_"), form, content)
+    write_recording(folder / "mcap", "mcap", content)
     return folder
-
-
-def recording(home, form):
-    place = home / form.replace(" ", "_")
-    return {"ros1": place.with_suffix(".bag"), "mcap file": place / f"{place.name}.mcap"}.get(form, place)
 
 
 def stream(home, out, source, *more):
@@ -105,15 +99,15 @@ def test_boxes_equal_detect_with_the_same_sweeps(home, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_all_forms_of_a_drive_have_the_same_boxes(home, tmp_path):
+    """tests/data/test_ros_bags.py reads all forms of recordings."""
     out = tmp_path / "boxes.jsonl"
     expected = without_file(stream(home, out, home / "drive", "--poses", home / "poses.json"))
     assert [line["timestamp_us"] for line in expected] == TIMES_US
     assert without_file(stream(home, out, home / "drive", "--poses", home / "poses.txt")) == expected
-    for form, how in zip(FORMS, ("/odom --topic /points", "tf", "/odom", "tf --topic /points"), strict=True):
-        source = recording(home, form)
-        lines = stream(home, out, source, f"--odometry {how}")
-        assert without_file(lines) == expected, form
-        assert lines[2]["file"] == f"{source}: /points: message 2"
+    for how in ("/odom", "tf --topic /points"):
+        lines = stream(home, out, home / "mcap", f"--odometry {how}")
+        assert without_file(lines) == expected, how
+        assert lines[2]["file"] == f"{home}/mcap: /points: message 2"
 
 
 @pytest.mark.slow
@@ -154,7 +148,7 @@ def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys
     single = json.loads((tmp_path / "b.json").read_text())["files"]
     assert [line["boxes"] for line in lines] == [file["boxes"] for file in single]
     assert {line["timestamp_us"] for line in lines} == {None}
-    recorded = stream(home, tmp_path / "a.jsonl", recording(home, "mcap"))  # whose times are known
+    recorded = stream(home, tmp_path / "a.jsonl", home / "mcap")  # whose times are known
     assert [(line["timestamp_us"], line["sensor_to_world"]) for line in recorded] == [(t, None) for t in TIMES_US]
 
 
