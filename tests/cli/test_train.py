@@ -13,31 +13,17 @@ import pytest
 from commands import assert_one_line_error, command, free_port, in_use, mistakes, wait_until
 from forked import Forked
 from linear_network import linear_network, use
-from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
+from tiny_run import NETWORK_OPTIONS, STEPS
 
 from fcos_lidar_jax import cli
-from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints import load_checkpoint
 from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.input_pipeline import database
-from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.training import run
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 VERSION = "v1.0-synthetic"
 MANY = 20_000  # steps of runs that are stopped
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    """Two scenes, one to train on and one to test on, with an index and objects."""
-    home = tmp_path_factory.mktemp("home")
-    (home / "sensor.json").write_text(json.dumps(sensor_to_json(SENSOR)))
-    command("synthesize --scenes 2 --keyframes 2 --out", home / "data", "--sensor", home / "sensor.json")
-    command("prepare --num-sweeps 1 --data-root", home / "data", "--version", VERSION)
-    save_checkpoint(home / "start", Checkpoint(CONFIG, SENSOR, weights(), 1))
-    with linear_network():
-        save_checkpoint(home / "linear", Checkpoint(CONFIG, SENSOR, untrained(CONFIG, SENSOR), 1))
-    return home / "data"
 
 
 def train(root: Path, out: Path, *more: str) -> list[str]:
@@ -188,7 +174,7 @@ BAD = mistakes(r"""
 --val-split other => split 'other': not found
 --train-split= => split '': not found
 --splits gone.json => gone.json: no such file
---samples 1 => --samples: got '1', expected FIRST:LAST with FIRST < LAST within the 2 frames, without overlap$
+--samples 1 => --samples: got '1', expected FIRST:LAST with FIRST < LAST within the 6 frames, without overlap$
 --samples 0:2,1:2 => --samples: got '1:2', expected
 --val-samples 2:2 => --val-samples: got '2:2', expected
 --resume => run.json: found nothing, expected the run to resume
