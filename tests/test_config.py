@@ -22,13 +22,7 @@ from fcos_lidar_jax.config import (
     config_from_json,
     config_to_json,
 )
-from fcos_lidar_jax.presets import (
-    ABOUT,
-    NUSCENES,
-    NUSCENES_SINGLE,
-    NUSCENES_TEST,
-    PRESETS,
-)
+from fcos_lidar_jax.presets import ABOUT, NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, PRESETS
 from fcos_lidar_jax.sensors import load_sensor
 
 MISSING = object()
@@ -73,11 +67,7 @@ def test_json_gives_back_the_configuration(name):
     [
         (("model", "stem", "groups"), "colours", "run: model.stem.groups: got 'colours', expected one of 'types'"),
         (("model", "fpn_channels"), "wide", "run: model.fpn_channels: got 'wide', expected int"),
-        (
-            ("model", "backbone_blocks"),
-            [1, 2],
-            r"run: model.backbone_blocks: got .*, expected a tuple of 4 int",
-        ),
+        (("model", "backbone_blocks"), [1, 2], r"run: model.backbone_blocks: got .*, expected a tuple of 4 int"),
         (("model", "stem"), 3, "run: model.stem: got int, expected a JSON object"),
         (("loss", "weight"), 1, "run: loss.weight: unknown field"),
         (("num_sweeps",), True, "run: num_sweeps: got True, expected int"),
@@ -121,6 +111,7 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: Config(class_ranges_m=(50.0,)),
         lambda: Config(copy_paste=CopyPasteConfig(targets=(2, 2))).paste_targets,
         lambda: Config(augment=None, inference=InferenceConfig(flips="x")),
+        lambda: Config(augment=AugmentConfig(flip_y_probability=0.0), inference=InferenceConfig(flips="xy")),
     ],
 )
 def test_nonsense_is_refused_at_construction(make):

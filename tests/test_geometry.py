@@ -7,14 +7,7 @@ import oracles
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fcos_lidar_jax.geometry import (
-    atan2,
-    points_in_box,
-    pose_matrix,
-    rotation_matrix,
-    safe_norm,
-    wrap_angle,
-)
+from fcos_lidar_jax.geometry import atan2, points_in_box, pose_matrix, rotation_matrix, safe_norm, wrap_angle
 
 
 def awkward_pairs():

@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 
 from fcos_lidar_jax.config import ModelConfig
-from fcos_lidar_jax.locations import (
-    STRIDES,
-    ImageLayout,
-    image_layout,
-    locate,
-    location_cells,
-    pad_image,
-)
+from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout, locate, location_cells, pad_image
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 from fcos_lidar_jax.types import RangeImage
 

@@ -170,9 +170,3 @@ def test_losses_are_weighed_by_name():
     losses = {"mine": f32(1.0), "classification": f32(8.0), "l1": f32(4.0), "iou": f32(2.0)}
     assert float(weighted(losses | {"iou_prediction": f32(6.0)}, config)) == 1 + 8 + 1 + 4 + 3
     assert float(weighted({"top_q": f32(3.0)}, config)) == 3
-
-
-def test_an_unknown_kind_is_rejected():
-    box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]]))
-    with pytest.raises(ValueError, match="kind: got 'ciou'"):
-        iou_loss(box, box, jnp.ones(1, bool), kind="ciou")

@@ -1,7 +1,6 @@
 """Check that both forms of rotated NMS keep the same boxes as a greedy loop with Shapely."""
 
 import functools
-import inspect
 
 import jax
 import jax.numpy as jnp
@@ -132,19 +131,6 @@ def test_exported_programs_use_the_form_of_their_platform():
     assert indices(*programs["cpu", "cuda"].call(boxes, scores, valid)) == expected
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"max_outputs": 0}, "max_outputs: got 0, expected at least 1"),
-        ({"overlap": "BEV"}, "overlap: got 'BEV', expected 'bev' or '3d'"),
-    ],
-)
-def test_wrong_options_are_rejected(options, message):
-    unchecked = inspect.unwrap(rotated_nms)  # without the types that the tests check in signatures
-    with pytest.raises(ValueError, match=f"^{message}$"):
-        unchecked(jnp.zeros((1, 7)), jnp.zeros(1), jnp.ones(1, bool), **OPTIONS | options)
-
-
 def merged_by_loops(boxes, scores, valid, labels, kept, threshold, *, vertical):
     result = []
     for i in kept:
@@ -199,15 +185,6 @@ def test_merging_does_not_depend_on_unused_slots(slots, monkeypatch):
     actual = merge(*spread[:2], valid, there, used, labels=spread[2])
     np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-5)
     assert np.abs(np.asarray(expected) - boxes[kept])[used].max() > 0.05
-
-
-def test_merging_loops_only_on_cpus():
-    boxes, scores, valid, labels = clusters(0, 20)
-    given = boxes, scores, valid, jnp.arange(5), jnp.ones(5, bool)
-    for platform, loops in (("cpu", 2), ("cuda", 0)):
-        merged = jax.jit(lambda *given: merge_boxes(*given, labels=labels, iou_threshold=0.3))
-        program = export.export(merged, platforms=(platform,))(*given)
-        assert program.mlir_module().count("stablehlo.while") == loops
 
 
 @FORMS

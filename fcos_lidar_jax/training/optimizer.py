@@ -18,8 +18,8 @@ def learning_rate_schedule(config: OptimizerConfig, num_steps: int) -> optax.Sch
     The final rate belongs to step ``num_steps``, so the last update, the step before, has a slightly higher rate.
 
     >>> schedule = learning_rate_schedule(OptimizerConfig(), 1000)
-    >>> [f"{float(schedule(step)):.1e}" for step in (0, 400, 999, 1000)]
-    ['1.0e-03', '1.0e-02', '1.7e-07', '1.0e-07']
+    >>> [f"{float(schedule(step)):.1e}" for step in (0, 200, 400, 999, 1000)]
+    ['1.0e-03', '5.5e-03', '1.0e-02', '1.7e-07', '1.0e-07']
     """
     return optax.cosine_onecycle_schedule(
         num_steps,
@@ -34,8 +34,8 @@ def momentum_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule
     """Cosine schedule of AdamW's b1: from high to low while the learning rate rises, then back.
 
     >>> schedule = momentum_schedule(OptimizerConfig(), 1000)
-    >>> [round(float(schedule(step)), 3) for step in (0, 400, 1000)]
-    [0.95, 0.85, 0.95]
+    >>> [round(float(schedule(step)), 3) for step in (0, 200, 400, 1000)]
+    [0.95, 0.9, 0.85, 0.95]
     """
     low, high = config.b1_range
     turn = int(config.warmup_fraction * num_steps)

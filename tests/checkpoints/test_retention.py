@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from commands import contents, cut
 from refusal import refused
 from tiny_run import CONFIG, SENSOR, bits
 
@@ -53,13 +54,9 @@ def steps(checkpoints: Checkpoints) -> list[int]:
     return [int(path.name) for path in checkpoints.paths()]
 
 
-def contents(checkpoints: Checkpoints) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in checkpoints.folder.rglob("*") if path.is_file()}
-
-
 def truncate(path: Path) -> None:
     largest = max((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
-    largest.write_bytes(largest.read_bytes()[:-1])
+    cut(largest, -1)
 
 
 def test_the_newest_checkpoints_and_the_best_are_kept(tmp_path):
@@ -74,11 +71,11 @@ def test_the_newest_checkpoints_and_the_best_are_kept(tmp_path):
 
 
 def test_recording_a_score_does_not_change_the_arrays(copy):
-    before = contents(copy)
+    before = contents(copy.folder)
     copy.record_score(6, 0.7)
     assert best_of(copy.paths()) == copy.folder / "00000006"
-    changed = [path for path, content in contents(copy).items() if content != before[path]]
-    assert changed == [copy.folder / "00000006" / "checkpoint.json"]
+    changed = [path for path, content in contents(copy.folder).items() if content != before[path]]
+    assert changed == ["00000006/checkpoint.json"]
     assert load_checkpoint(copy.folder / "00000006").score == 0.7
     assert bits(copy.newest(shapes())[1]) == bits(state_at(6))
     Checkpoints(copy.folder, keep=1).record_score(6, 0.8)
@@ -103,7 +100,7 @@ def test_a_kill_while_a_score_is_recorded_does_not_damage_the_checkpoint(copy, t
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_an_interruption_of_the_replacement_keeps_the_old_checkpoint(copy, monkeypatch, number):
-    before = contents(copy)
+    before = contents(copy.folder)
     replace, calls = os.replace, []
 
     def interrupted(source, target):
@@ -115,7 +112,7 @@ def test_an_interruption_of_the_replacement_keeps_the_old_checkpoint(copy, monke
     monkeypatch.setattr(storage.os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         save(copy, 6, 0.9)
-    assert contents(copy) == before
+    assert contents(copy.folder) == before
 
 
 def test_corrupt_checkpoints_are_skipped_with_a_warning(copy, capsys):

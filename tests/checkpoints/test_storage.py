@@ -11,15 +11,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from commands import cut, flip
 from tiny_run import CONFIG, SENSOR, bits
 
-from fcos_lidar_jax.checkpoints import (
-    Checkpoint,
-    CheckpointError,
-    load_checkpoint,
-    load_state,
-    save_checkpoint,
-)
+from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, load_state, save_checkpoint
 from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.models import build_detector
@@ -123,19 +118,9 @@ def test_a_checkpoint_that_uses_a_removed_feature_is_refused(copy):
         load_checkpoint(copy)
 
 
-def truncate(file: Path) -> None:
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
-
-def flip(file: Path) -> None:
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-
-
 DAMAGES = {  # what happens to a file, and the message
-    "cut": (truncate, "got hash .*, expected hash"),
-    "one bit": (flip, "got hash .*, expected hash"),
+    "cut": (lambda file: cut(file, -9), "got hash .*, expected hash"),
+    "one bit": (lambda file: flip(file, 9), "got hash .*, expected hash"),
     "missing": (Path.unlink, "got no file, expected hash"),
     "additional": (
         lambda file: file.with_name(f"{file.name}.new").write_text("x"),

@@ -2,12 +2,11 @@
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, run_python
+from commands import command, run_python
 from tiny_run import TINY_CONFIG, untrained
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
@@ -70,10 +69,3 @@ def test_the_python_of_the_export_page_runs(home):
     (home / "run.py").write_text(f"import os\nos.chdir({str(home)!r})\n{code}\nprint(boxes.shape)")
     ran = run_python(home / "run.py")
     assert ran.stdout == "(20, 9)\n", ran.stderr
-
-
-def test_a_missing_package_is_one_line(home, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    words = ["export", "--network-only", "--format", "onnx", "--checkpoint", str(home / "checkpoint"), "--out"]
-    assert_one_line_error(capsys, [*words, str(tmp_path / "a")], r"pip install -e '\.\[cpu\]'")
-    assert list(tmp_path.iterdir()) == []

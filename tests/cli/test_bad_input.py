@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, mistakes
+from commands import assert_one_line_error, command, contents, in_use, mistakes
 from made_kitti import calibration_text
 from made_nuscenes import VERSION, make_tables, write
 from tiny_run import TINY_CONFIG, untrained
@@ -19,10 +19,11 @@ from fcos_lidar_jax.simulation.frames import make_frame
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """Clouds, poses, checkpoints and a data set in the nuScenes layout."""
+    """Clouds, poses, a checkpoint, its export and a data set in the nuScenes layout."""
     folder = tmp_path_factory.mktemp("home")
     checkpoint = Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 7)
     save_checkpoint(folder / "checkpoint", checkpoint)
+    command("export --checkpoint", folder / "checkpoint", "--out", folder / "detector.fcos")
     points = make_frame(0, TINY).points
     drive = folder / "training" / "velodyne"
     drive.mkdir(parents=True)
@@ -31,18 +32,16 @@ def home(tmp_path_factory):
     np.save(folder / "away.npy", points + np.array([500, 500, 0, 0, 0], np.float32))
     np.save(folder / "no_rows.npy", points[:0])
     np.save(folder / "scaled_ring.npy", np.column_stack([points[:, :4], np.arange(len(points)) % 16 / 15]))
-    np.zeros((9, 5), np.float32).tofile(folder / "cloud.pcd.bin")
     (folder / "link.json").symlink_to("good.npy")
-    for name in ("empty.bin", "a.bag"):
-        (folder / name).touch()
+    (folder / "a.bag").touch()
     (folder / "calibration.txt").write_text(calibration_text())
     (folder / "labels").mkdir()
     (folder / "labels" / "0.txt").write_text("Car 0.00 0 0.1 10 20 30 40 1.5 1.6 3.9 1 2 9 0.2\n")
     entry = {"sensor_to_world": np.eye(4).tolist()}
     poses = [{**entry, "file": f"training/velodyne/{i}.npy", "timestamp_us": 50_000 * i} for i in (1, 0)]
     (folder / "poses.json").write_text(json.dumps(poses))
-    (folder / "truth.json").write_text("{}")
-    (folder / "results_nusc.json").write_text("{}")
+    (folder / "truth.json").write_text('{"a": {"ego_translation": [0, 0, 0], "boxes": []}}')
+    (folder / "results_nusc.json").write_text('{"meta": {}, "results": {"a": []}}')
     write(folder / "data", *make_tables(1))
     return folder
 
@@ -52,7 +51,6 @@ BAD = mistakes(r"""
 detect => INPUT: got none, expected one, or --sweeps$
 detect HOME/good.npy --sweeps HOME/poses.json => --sweeps: got .*, expected none with INPUT: 
 detect HOME/good.npy HOME/none.npy => none.npy: no such file
-detect HOME/empty.bin => empty.bin: empty file
 detect HOME/away.npy HOME/no_rows.npy => away.npy: none of its .* points is usable
 detect HOME/training => training: no point file in it, expected [^;]*$
 detect HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* 1 \(num_sweeps\): .*--columns
@@ -69,7 +67,6 @@ detect HOME/good.npy --yaw-deg nan => --yaw-deg: got nan, expected within \[-360
 detect HOME/good.npy --batch-size 0 => --batch-size: got 0, expected at least 1$
 detect HOME/good.npy --data-sensor sonar => sonar: no such sensor
 detect HOME/good.npy --labels submarine => --labels: got 'submarine', expected some of
-detect HOME/cloud.pcd.bin --intensity-scale 9 => cloud.pcd.bin: intensity scale: got 9, expected
 detect HOME/good.npy --calibration HOME => --calibration: got .*, expected only with --output-format kitti$
 detect HOME/good.npy --output-format kitti => kitti: .*good.txt: no such file, expected --calibration
 detect LABELLED --output-format kitti --out HOME/labels => 0.txt: found labels, which have no score
@@ -77,18 +74,18 @@ detect HOME/good.npy --output-format nuscenes => --output-format nuscenes: found
 detect HOME/good.npy --out HOME/good.npy => --out: .*the same file as .*good.npy
 detect HOME/good.npy --out OUT --page OUT => --page: .*the same file as .*out
 detect HOME/training/velodyne --out HOME/training/velodyne/0.npy => --out: .*found a point file
+detect HOME/good.npy gs://b/run => gs://b/run: got a URL, expected a path: copy
 detect HOME/none.npy --out HOME/link.json => link.json: found a link to .*good
-detect HOME/none.npy --out . => error: .: found a folder, expected a file to write
-detect HOME/none.npy --out /dev/null => /dev/null: found a device or a pipe
 detect HOME/none.npy --out HOME/good.npy/x => good.npy: found a file, expected a fol
 detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*the place of the checkpoint
+detect HOME/good.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos => the place of the checkpoint
+detect HOME/good.npy --checkpoint HOME/detector.fcos --batch-size 2 => batch size: got 2, expected 1
 detect HOME/none.npy --pictures HOME/good.npy => --pictures: .*: found a file, expect
 stream => SOURCE: got none, expected one, or --data-root$
 stream HOME --data-root HOME --scene a => --data-root: .*, expected none with SOURCE: it takes the place of SOURCE
 stream HOME/nowhere => nowhere: no such file or folder
-stream HOME/empty.bin => empty.bin: empty file
-stream HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 .* at most 1
 stream HOME/training/velodyne --track => --track: found no poses
+stream HOME/good.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos => the place of the checkpoint
 stream HOME/training/velodyne --keyframes => --keyframes: expected only with --data-root
 stream HOME/training/velodyne --min-score 2 => --min-score: got 2.0, expected
 stream HOME/training/velodyne --poses HOME/poses.json --out HOME/poses.json => --out: .*the same file as
@@ -103,7 +100,6 @@ evaluate => --checkpoint: got none, expected one, or --results$
 evaluate --results HOME/truth.json => data root: missing, expected the folder of a data set
 evaluate --checkpoint x --ground-truth HOME/truth.json => --ground-truth: .* expected none with --checkpoint
 evaluate --results x --split val --ground-truth HOME/truth.json => --ground-truth: .* expected none with --split
-evaluate --results x --ground-truth HOME/none.json => none.json: no such file
 evaluate --results x --ground-truth HOME/truth.json --bootstrap -1 => --bootstrap: got -1, expected at least 0
 evaluate --results x --ground-truth HOME/truth.json --batch-size 2 => --results: .* none with --batch-size
 evaluate --results x --ground-truth HOME/results_nusc.json --out HOME => --out: .*results_nusc.json: the same file
@@ -118,40 +114,69 @@ evaluate DATA --checkpoint quickstart --coordinator a:1 --num-processes 2 --proc
 evaluate DATA --distributed --results x => --results: got x, expected none with --distributed: nothing is detected
 evaluate DATA --distributed --checkpoint quickstart --backend openvino => --backend: got openvino, expected none
 evaluate --format simulated --checkpoint HOME/checkpoint --version v1 => version: got v1, expected none
+train quickstart --format simulated --out gs://b/run => gs://b/run: got a URL, expected a path: copy
+train quickstart --data-root gs://b/run => gs://b/run: got a URL, expected a path: copy
+train quickstart --format simulated => all 100000 frames .* --no-class-balanced --no-copy-paste, or at most
+train quickstart --format simulated --no-copy-paste => all 100000 frames .* --no-class-balanced, or at most 2000
+train quickstart DATA --train-split all --val-split none => made: no index here, .* run fcos-lidar prepare$
 train quickstart --data-root HOME/none => none: no such folder
 train quickstart --format simulated --num-processes 2 => --num-processes: got 2, expected only with --process-index
-prepare --data-root HOME/none --index OUT => none: no such folder
+prepare DATA --train-split other --index OUT => split 'other': not found
 prepare --format simulated --index OUT => simulated frames need no preparation
 prepare DATA --index OUT --workers 0 => --workers: got 0, expected at least 1
-project HOME/none.bin => none.bin: no such file
-project HOME/good.npy --sensor argoverse2 => good.npy: no laser number
+project HOME/good.npy --sensor gs://b/run => gs://b/run: got a URL, expected a path: copy
 project HOME/good.npy --rounds 100000 => --rounds: got 100000, expected within \[1, 100\]$
 project HOME/away.npy => away.npy: none of its
 project HOME/good.npy --png HOME/good.npy => --png: .*the same file as
 synthesize --scenes 1 --sensor argoverse2 => --sensor: got argoverse2, whose rows come from laser numbers
+synthesize --scenes 0 => --scenes: got 0, expected at least 1
+synthesize --scenes 1 --seed -1 => --seed: got -1, expected at least 0
+synthesize --scenes 1 --version samples => --version: got 'samples', expected a name for the folder of the tables
 synthesize --scenes 1 --version ../a => --version: got '../a', expected a name for the folder of the tables
-export --checkpoint HOME/none => none: found nothing
+export --checkpoint gs://b/run => gs://b/run: got a URL, expected a path: copy
+export --checkpoint HOME/checkpoint --out HOME => found a folder
+export --checkpoint HOME/checkpoint --out HOME/checkpoint/a => the place of the checkpoint
+export --checkpoint HOME/detector.fcos => found a file, expected a checkpoint folder
 export --checkpoint HOME/checkpoint --network-only => --network-only: got True, expected only with --format onnx$
 export --checkpoint HOME/checkpoint --format onnx --batch 2 => --batch: got 2, expected only with --format jax$
 benchmark --checkpoint HOME/checkpoint --batch 0 => --batch: got \(0,\), expected at least 1
-benchmark HOME/none.npy --checkpoint HOME/checkpoint => none.npy: no such file
+benchmark --checkpoint HOME/detector.fcos --batch 2 => batch size: got 2
+benchmark --checkpoint HOME/detector.fcos --backend openvino => found an exported program
+benchmark --checkpoint HOME/detector.fcos --out HOME/detector.fcos => the place of the checkpoint
 demo --keyframes 0 => --keyframes: got 0
+demo --out gs:/b/run => gs://b/run: got a URL, expected a path: copy
 demo --out HOME/good.npy => --out: .*: found a file
 """)
 
 
 @pytest.mark.parametrize(("line", "message"), BAD)
-def test_a_bad_input_gets_one_line_and_leaves_nothing(home, tmp_path, capsys, line, message):
+def test_a_bad_input_gets_one_line_and_leaves_nothing(home, tmp_path, monkeypatch, capsys, line, message):
+    monkeypatch.chdir(tmp_path)
     line += "" if any(word in line for word in ("OUT", "--out ", "--index ")) else " --out OUT"
     own = line.split()[0] in ("detect", "stream") and "--checkpoint" not in line
     line += " --checkpoint HOME/checkpoint" if own else ""
     line = line.replace("DATA", f"--data-root HOME/data --version {VERSION}")
     line = line.replace("LABELLED", "HOME/good.npy --calibration HOME/calibration.txt")
-    before = {file: file.read_bytes() for file in home.rglob("*") if file.is_file()}
+    before = contents(home)
     args = line.replace("HOME", str(home)).replace("OUT", str(tmp_path / "out")).split()
     assert_one_line_error(capsys, args, message)
     assert [*tmp_path.iterdir()] == []
-    assert all(file.read_bytes() == content for file, content in before.items())
+    assert contents(home) == before
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"prepare --data-root HOME/data --version {VERSION} --train-split all --index",
+        f"evaluate --data-root HOME/data --version {VERSION} --split all --checkpoint HOME/checkpoint --out",
+        "evaluate --results HOME/results_nusc.json --ground-truth HOME/truth.json --out",
+    ],
+)
+def test_a_folder_in_use_is_left_alone(home, tmp_path, capsys, line):
+    with in_use(tmp_path):
+        words = [*line.replace("HOME", str(home)).split(), str(tmp_path)]
+        assert_one_line_error(capsys, words, "in use: process .* is at work")
+        assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize("line", ["detect HOME/good.npy", "stream HOME/good.npy", "evaluate --format simulated"])
@@ -160,13 +185,6 @@ def test_recordings_need_rerun(home, tmp_path, capsys, monkeypatch, line):
     words = [*line.replace("HOME", str(home)).split(), "--out", str(tmp_path / "out")]
     words += ["--checkpoint", str(home / "checkpoint"), "--rrd", str(tmp_path / "a.rrd")]
     assert_one_line_error(capsys, words, "--rrd: rerun is not installed")
-
-
-def test_an_exported_program_has_no_other_backend_and_size(home, tmp_path, capsys):
-    command("export --checkpoint", home / "checkpoint", "--out", tmp_path / "detector.fcos")
-    for more, message in (("--backend openvino", "found an exported program"), ("--batch 2", "batch size: got 2")):
-        words = ["benchmark", *more.split(), "--checkpoint", str(tmp_path / "detector.fcos")]
-        assert_one_line_error(capsys, words, message)
 
 
 def test_other_classes_are_not_of_nuscenes(home, tmp_path, capsys):

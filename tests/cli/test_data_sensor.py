@@ -12,7 +12,7 @@ import pytest
 from commands import command, page_content
 from made_argoverse2 import make_log
 from made_folder import make_folder
-from made_kitti import make_kitti
+from made_kitti import make_kitti, write_raw_drive
 from tiny_run import CONFIG, NETWORK_OPTIONS, untrained
 
 import fcos_lidar_jax as fcos
@@ -53,13 +53,7 @@ def kitti(tmp_path_factory):
     (root / "elsewhere").mkdir()
     cloud = root / "training" / "velodyne" / "000000.bin"
     shutil.copy(cloud, root / "elsewhere" / "cloud.bin")
-    drive = root / "day" / "drive"
-    for name in ("velodyne_points/data", "oxts/data"):
-        (drive / name).mkdir(parents=True)
-    shutil.copy(cloud, drive / "velodyne_points" / "data" / "0000000000.bin")
-    (drive / "oxts" / "data" / "0000000000.txt").write_text("49 8.4 110 0 0 0")
-    (drive / "velodyne_points" / "timestamps.txt").write_text("2011-09-26 13:02:25.594360375\n")
-    (root / "day" / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n")
+    write_raw_drive(root / "day", [np.fromfile(cloud, np.float32)], ["49 8.4 110 0 0 0"])
     return root
 
 

@@ -9,7 +9,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from commands import in_use, page_content
+from commands import page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
@@ -124,7 +124,7 @@ def leaves(value):
 
 @pytest.mark.slow
 def test_a_checkpoint_is_evaluated_and_larger_batches_change_boxes_only_by_rounding(home, tmp_path, capsys):
-    """tests/cli/test_faults.py resumes an evaluation that was killed."""
+    """tests/cli/test_processes.py resumes an evaluation."""
     options = {"checkpoint": home / "checkpoint", **place(home), "report": False}
     run(Evaluate(out=tmp_path / "single", **options))
     assert "frames 6/6" in capsys.readouterr().err
@@ -169,18 +169,6 @@ def test_an_earlier_report_is_removed(home, by_tables, tmp_path):
     assert list(mine.parent.iterdir()) == [mine]
 
 
-def test_explains_empty_truth_and_empty_results(home, tmp_path, capsys):
-    results, truth = read(home / "results.json"), read(home / "truth.json")
-    truth = {token: {**sample, "boxes": []} for token, sample in truth.items()}
-    results["results"] = {token: [] for token in truth}
-    by_files(tmp_path, results, truth, bootstrap=3)
-    errors = capsys.readouterr().err
-    assert "no ground truth is evaluated:" in errors
-    assert "the results contain no boxes" in errors
-    assert read(tmp_path / "out" / "metrics_summary.json")["nd_score"] == 0
-    assert (tmp_path / "out" / "report.html").is_file()
-
-
 def test_with_a_class_map_the_metric_is_not_the_official_one(home, tmp_path):
     (tmp_path / "map.json").write_text(json.dumps(dict.fromkeys(NUSCENES_CLASSES[1:], None)))
     data = dataclasses.replace(place(home)["data"], class_map=str(tmp_path / "map.json"))
@@ -204,11 +192,3 @@ def test_results_need_only_the_tables(home, by_tables, tmp_path, capsys):
     summary, expected = (read(folder / "metrics_summary.json") for folder in (tmp_path / "out", by_tables))
     assert summary["mean_ap"] == expected["mean_ap"] > 0
     assert "M?nchen" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("what", ["checkpoint", "results"])
-def test_a_folder_in_use_is_left_alone(home, tmp_path, what):
-    given = {what: home / {"checkpoint": "checkpoint", "results": "results.json"}[what]}
-    with in_use(tmp_path), pytest.raises(BlockingIOError, match="in use: process "):
-        run(Evaluate(out=tmp_path, **given, **place(home)))
-    assert [path.name for path in tmp_path.iterdir()] == [".lock"]

@@ -1,18 +1,13 @@
-"""Commands that are killed, or meet a full disk or a read-only folder. Tests of single commands ask more."""
+"""Commands that meet a full disk or a read-only folder. Tests of single commands ask more."""
 
 import ctypes
 import functools
-import hashlib
-import json
 import os
 import resource
-import signal
 
 import pytest
-from commands import command
-from forked import Forked, signal_at
-
-from fcos_lidar_jax.evaluation.resume_log import ResumeLog
+from commands import command, contents
+from forked import Forked
 
 pytestmark = pytest.mark.slow
 
@@ -29,31 +24,15 @@ def give_up_privileges() -> None:
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A simulated data set, and the files of an undisturbed evaluation on it."""
+    """A simulated data set."""
     folder = tmp_path_factory.mktemp("faults")
     folder.chmod(0o755)
     command(*SYNTHESIZE, "--out", folder / "data")
-    command(*evaluate(folder), "--out", folder / "evaluated")
     return folder
-
-
-def evaluate(home):
-    data = ["--data-root", home / "data", "--version", VERSION, "--split", "train"]
-    return ["evaluate", *data, "--checkpoint", "quickstart", "--no-report", "--batch-size", "1"]
 
 
 def prepare(home):
     return ["prepare", "--data-root", home / "data", "--version", VERSION, "--train-split", "train"]
-
-
-def contents(folder):
-    """Checksums of all files except the lock, leaving out the time in the summary."""
-    files = (file for file in folder.rglob("*") if file.is_file() and file.name != ".lock")
-    content_of = {str(file.relative_to(folder)): file.read_bytes() for file in files}
-    if "metrics_summary.json" in content_of:
-        summary = json.loads(content_of["metrics_summary.json"])
-        content_of["metrics_summary.json"] = json.dumps({**summary, "eval_time": 0}).encode()
-    return {name: hashlib.blake2b(content).hexdigest() for name, content in content_of.items()}
 
 
 def error_line(args, before):
@@ -80,15 +59,3 @@ def test_synthesize_resumes_after_a_full_disk(home, tmp_path):
     error_line([*SYNTHESIZE, "--out", tmp_path / "data"], limit)
     command(*SYNTHESIZE, "--out", tmp_path / "data")
     assert contents(tmp_path / "data") == contents(home / "data")
-
-
-def test_a_killed_evaluation_resumes_to_the_same_files(home, tmp_path):
-    out = tmp_path / "evaluated"
-    killed = functools.partial(signal_at, f"{ResumeLog.__module__}.ResumeLog.add", signal.SIGKILL, 2)
-    for finished in (1, 2):  # frames in the log: each process adds one
-        code, _, errors = Forked([*evaluate(home), "--out", out], killed).end()
-        assert code == -signal.SIGKILL, errors
-        assert len((out / ".results_nusc.json.resume_log").read_bytes().splitlines()) == 1 + finished
-    assert not (out / "results_nusc.json").exists()
-    command(*evaluate(home), "--out", out)
-    assert contents(out) == contents(home / "evaluated")

@@ -6,9 +6,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
-from commands import assert_one_line_error, command, contents, in_use, run_python
+from commands import assert_one_line_error, command, contents, cut, run_python
 from kills import killed_twice
 from made_nuscenes import VERSION, make_tables, write
 
@@ -57,12 +56,6 @@ def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     assert len(states - {(), tuple(expected)}) >= 4  # kills at different stages
 
 
-def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
-    with in_use(tmp_path / "i"):
-        assert_one_line_error(capsys, prepare(root, tmp_path / "i"), "i: in use: process ")
-        assert list(contents(tmp_path / "i")) == [".lock"]
-
-
 def test_objects_come_only_from_the_training_split(root, tmp_path):
     command(*prepare(root, tmp_path / "i", "--train-split", "scene-1"))
     objects = open_database(tmp_path / "i" / "objects" / "scene-1")
@@ -78,62 +71,28 @@ def test_objects_come_only_from_the_training_split(root, tmp_path):
     assert [shard.name for shard in objects.manifest.shards] == ["scene-1"]
 
 
-def test_an_index_of_changed_tables_is_rebuilt_with_a_message(root, tmp_path, capsys):
-    copy = shutil.copytree(root, tmp_path / "copy")
-    command(*prepare(copy, tmp_path / "i"))
-    file = copy / VERSION / "sample_annotation.json"
+def change_tables(root: Path, index: Path) -> None:
+    file = root / VERSION / "sample_annotation.json"
     rows = json.loads(file.read_text())
     file.write_text(json.dumps([{**r, "next": "", "prev": ""} for r in rows][:-1]))
-    capsys.readouterr()
-    command(*prepare(copy, tmp_path / "i"))
-    out, err = capsys.readouterr()
-    assert "sample_annotation.json: the index was made from another table" in err
-    assert json.loads(out)["annotations"] == 16 * SCENES - 1
-    command(*prepare(copy, tmp_path / "new"))
-    assert contents(tmp_path / "i") == contents(tmp_path / "new")
-
-
-def test_clouds_without_usable_points_are_reported_once_and_no_others_refused(root, tmp_path, capsys):
-    copy = shutil.copytree(root, tmp_path / "copy")
-
-    def place_all_points(scene, x):
-        for file in copy.glob(f"s*/*/{scene}-*"):
-            np.array([[x, 9, 0, 9, 0]], np.float32).tofile(file)
-
-    place_all_points("*", 9)
-    place_all_points("0", 1e4)
-    command(*prepare(copy, tmp_path / "i"))
-    note = "note: 4 of 24 clouds without usable points, and so without objects: the first is "
-    assert capsys.readouterr().err.count(note) == 1
-    place_all_points("*", 1e4)
-    assert_one_line_error(capsys, prepare(copy, tmp_path / "i"), "points is usable")
-
-
-def test_an_invalid_index_is_rebuilt_with_a_message(root, tmp_path, capsys):
-    command(*prepare(root, tmp_path / "i"))
-    before = contents(tmp_path / "i")
-    file = tmp_path / "i" / "index.json"
-    file.write_text(file.read_text()[:100])
-    command(*prepare(root, tmp_path / "i"))
-    line = next(line for line in capsys.readouterr().err.splitlines() if "index.json: not JSON" in line)
-    assert line.endswith(": rebuilding it")
-    assert contents(tmp_path / "i") == before
 
 
 @pytest.mark.parametrize(
-    ("splits", "more", "expected"),
+    ("spoil", "told"),
     [
-        (None, "--train-split other", "split 'other': not found in"),
-        ({"train": ["scene-99"]}, "--train-split train", "split 'train': scene-99: no such scene in"),
+        (change_tables, "sample_annotation.json: the index was made from another table"),
+        (lambda root, index: cut(index / "index.json", 100), "index.json: not JSON"),
     ],
 )
-def test_a_wrong_split_is_refused_before_the_index_is_made(root, tmp_path, capsys, splits, more, expected):
+def test_an_index_that_cannot_be_used_is_rebuilt_with_a_message(root, tmp_path, capsys, spoil, told):
     copy = shutil.copytree(root, tmp_path / "copy")
-    (copy / VERSION / "splits.json").unlink()
-    if splits is not None:
-        (copy / VERSION / "splits.json").write_text(json.dumps(splits))
-    assert_one_line_error(capsys, prepare(copy, tmp_path / "i", *more.split()), expected)
-    assert not (tmp_path / "i").exists()
+    command(*prepare(copy, tmp_path / "i"))
+    spoil(copy, tmp_path / "i")
+    command(*prepare(copy, tmp_path / "i"))
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if told in line)
+    assert line.endswith(": rebuilding it")
+    command(*prepare(copy, tmp_path / "new"))
+    assert contents(tmp_path / "i") == contents(tmp_path / "new")
 
 
 def test_the_folder_is_told_before_it_is_written_and_asked_for_otherwise(root, tmp_path, monkeypatch, capsys):

@@ -5,22 +5,20 @@ import json
 import re
 import shutil
 import signal
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import assert_one_line_error, command, in_use
+from commands import assert_one_line_error, command, free_port, in_use
 from forked import Forked, signal_at
 from linear_network import linear_network, use
-from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
+from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
@@ -81,25 +79,6 @@ def test_a_missing_launcher_gets_one_line(tmp_path, capsys, monkeypatch):
     message = "--distributed: found no launcher .* expected Slurm, Open MPI or a TPU pod"
     assert_one_line_error(capsys, [*train[0].split(), train[1]], message)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    """Two scenes of six keyframes, one for training and one for tests, with an index; checkpoints beside them."""
-    home = tmp_path_factory.mktemp("home")
-    (home / "sensor.json").write_text(json.dumps(sensor_to_json(SENSOR)))
-    command("synthesize --scenes 2 --keyframes 6 --out", home / "data", "--sensor", home / "sensor.json")
-    command("prepare --num-sweeps 1 --data-root", home / "data")
-    save_checkpoint(home / "start", Checkpoint(CONFIG, SENSOR, weights(), 1))
-    with linear_network():
-        save_checkpoint(home / "linear", Checkpoint(CONFIG, SENSOR, untrained(CONFIG, SENSOR), 1))
-    return home / "data"
-
-
-def free_port() -> str:
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        return str(free.getsockname()[1])
 
 
 def start_two(how: str, *args: list[str], before: tuple[Callable[[], object], ...] = (int, int)) -> list[Forked]:

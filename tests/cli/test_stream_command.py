@@ -4,13 +4,14 @@ import contextlib
 import dataclasses
 import json
 import re
+import shutil
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, page_content
 from made_argoverse2 import STEP_NS, make_log
-from made_bags import FORMS, structured, write_recording
+from made_bags import structured, write_recording
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
@@ -18,7 +19,6 @@ from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.cli import stream as cli_stream
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
-from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -29,7 +29,7 @@ TIMES_US = [(START_NS + index * STEP) // 1000 for index in range(SWEEPS)]
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A detector of three sweeps, and a drive as a folder with poses in JSON and TUM and as ROS recordings."""
+    """A detector of three sweeps, and a drive as a folder with poses in JSON and TUM and as a ROS recording."""
     folder = tmp_path_factory.mktemp("home")
     config = dataclasses.replace(TINY_CONFIG, num_sweeps=WINDOW)
     save_checkpoint(folder / "checkpoint", Checkpoint(config, TINY, untrained(config, TINY), 7))
@@ -55,14 +55,8 @@ def home(tmp_path_factory):
             yield "/tf", make.transform(stamp, "odom", "lidar", place, turn)
             yield "/points", make.cloud(stamp, structured(cloud))
 
-    for form in FORMS:
-        write_recording(folder / form.replace(" ", "_"), form, content)
+    write_recording(folder / "mcap", "mcap", content)
     return folder
-
-
-def recording(home, form):
-    place = home / form.replace(" ", "_")
-    return {"ros1": place.with_suffix(".bag"), "mcap file": place / f"{place.name}.mcap"}.get(form, place)
 
 
 def stream(home, out, source, *more):
@@ -105,15 +99,15 @@ def test_boxes_equal_detect_with_the_same_sweeps(home, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_all_forms_of_a_drive_have_the_same_boxes(home, tmp_path):
+    """tests/data/test_ros_bags.py reads all forms of recordings."""
     out = tmp_path / "boxes.jsonl"
     expected = without_file(stream(home, out, home / "drive", "--poses", home / "poses.json"))
     assert [line["timestamp_us"] for line in expected] == TIMES_US
     assert without_file(stream(home, out, home / "drive", "--poses", home / "poses.txt")) == expected
-    for form, how in zip(FORMS, ("/odom --topic /points", "tf", "/odom", "tf --topic /points"), strict=True):
-        source = recording(home, form)
-        lines = stream(home, out, source, f"--odometry {how}")
-        assert without_file(lines) == expected, form
-        assert lines[2]["file"] == f"{source}: /points: message 2"
+    for how in ("/odom", "tf --topic /points"):
+        lines = stream(home, out, home / "mcap", f"--odometry {how}")
+        assert without_file(lines) == expected, how
+        assert lines[2]["file"] == f"{home}/mcap: /points: message 2"
 
 
 @pytest.mark.slow
@@ -133,6 +127,13 @@ def test_keyframes_skip_the_boxes_of_other_sweeps_and_are_called_by_their_tokens
     lines = some.read_text().splitlines()
     assert len(lines) == 3
     assert set(lines) < set(every.read_text().splitlines())
+    expected = [json.loads(line) for line in every.read_text().splitlines()]
+    (tmp_path / "drive").mkdir()
+    copied = [{**line, "file": shutil.copy(line["file"], tmp_path / "drive")} for line in expected]
+    listed = [{key: line[key] for key in ("file", "timestamp_us", "sensor_to_world")} for line in copied]
+    (tmp_path / "poses.json").write_text(json.dumps(listed))
+    posed = stream(home, tmp_path / "posed.jsonl", tmp_path / "drive", "--poses", tmp_path / "poses.json")
+    assert without_file(posed) == without_file(expected)
     command("stream", data, "--keyframes --output-format nuscenes --out", tmp_path / "results.json")
     samples = json.loads(scenes.with_name("sample.json").read_text())
     by_time = [sample["token"] for sample in sorted(samples, key=lambda sample: sample["timestamp"])]
@@ -147,7 +148,7 @@ def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys
     single = json.loads((tmp_path / "b.json").read_text())["files"]
     assert [line["boxes"] for line in lines] == [file["boxes"] for file in single]
     assert {line["timestamp_us"] for line in lines} == {None}
-    recorded = stream(home, tmp_path / "a.jsonl", recording(home, "mcap"))  # whose times are known
+    recorded = stream(home, tmp_path / "a.jsonl", home / "mcap")  # whose times are known
     assert [(line["timestamp_us"], line["sensor_to_world"]) for line in recorded] == [(t, None) for t in TIMES_US]
 
 
@@ -257,37 +258,3 @@ def test_a_log_of_argoverse2_is_a_source(home, tmp_path):
     assert np.diff([line["timestamp_us"] for line in lines]).tolist() == [STEP_NS // 1000] * 3
     for index, line in enumerate(lines):
         assert line["sensor_to_world"] == frames.pose(index).tolist()
-
-
-@pytest.mark.slow
-@pytest.mark.real_data
-def test_a_real_scene_has_the_same_boxes_in_all_forms(real_data, home, tmp_path):
-    root, out = real_data / "nuscenes_scene0523", tmp_path / "boxes.jsonl"
-    # The index brings the tables' quaternions to unit length, which changes last digits: all have the index's.
-    index = NuScenes(root, "v1.0-scene0523").index
-    [scene], rows = set(index.scene_name.astype(str).tolist()), index.sample_sweep
-
-    def content(make):
-        mount = index.sweep_sensor[rows[0]]
-        extrinsic = index.sensor_translation[mount], index.sensor_rotation[mount][[1, 2, 3, 0]]
-        yield "/tf_static", make.transform(0, "base_link", "lidar", *extrinsic)
-        for row in rows.tolist():
-            stamp = int(index.sweep_time_us[row]) * 1000
-            points = np.fromfile(root / index.sweep_file[row].decode(), np.float32).reshape(-1, 5)
-            ego = index.ego_translation[row], index.ego_rotation[row][[1, 2, 3, 0]]
-            yield "/odom", make.odometry(stamp, *ego)
-            yield "/points", make.cloud(stamp, structured(points))
-
-    how = "--keyframes --checkpoint", home / "checkpoint", "--out", out
-    command("stream --data-root", root, "--scene", scene, *how)
-    expected = [json.loads(line) for line in out.read_text().splitlines()]
-    assert len(expected) == len(rows) == 40
-    lines = [
-        {"file": line["file"], "timestamp_us": line["timestamp_us"], "sensor_to_world": line["sensor_to_world"]}
-        for line in expected
-    ]
-    (tmp_path / "poses.json").write_text(json.dumps(lines))
-    folder = root / "samples" / "LIDAR_TOP"
-    assert stream(home, out, folder, "--poses", tmp_path / "poses.json") == expected
-    bag = write_recording(tmp_path / "bag", "mcap", content)
-    assert without_file(stream(home, out, bag, "--odometry /odom")) == without_file(expected)

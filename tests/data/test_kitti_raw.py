@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_kitti import write_raw_drive
 from refusal import refused
 
 from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
@@ -16,20 +17,11 @@ YAW = 0.5
 @pytest.fixture
 def recording(tmp_path):
     """Two sweeps near Karlsruhe: 8 m to the east and 6 m to the north in 0.1 s; the LiDAR ahead of the IMU."""
-    folder = tmp_path / "day" / "drive"
-    for name in ("velodyne_points/data", "oxts/data"):
-        (folder / name).mkdir(parents=True)
     east = 8 / METRES_A_DEGREE / np.cos(np.deg2rad(49))
-    for index in range(2):
-        points = np.full((3, 4), [5 + index, 1, 0, 0.5], np.float32)
-        points.tofile(folder / f"velodyne_points/data/{index:010d}.bin")
-        values = 49 + index * 6 / METRES_A_DEGREE, 8.4 + index * east, 110 + index, 0, 0, YAW, 1, 2, 3
-        (folder / f"oxts/data/{index:010d}.txt").write_text(" ".join(repr(float(value)) for value in values))
-    stamps = "2011-09-26 13:02:25.594360375\n2011-09-26 13:02:25.694360375\n"
-    (folder / "velodyne_points/timestamps.txt").write_text(stamps)
-    calibration = "calib_time: 25-May-2012\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n"
-    (folder.parent / "calib_imu_to_velo.txt").write_text(calibration)
-    return folder
+    clouds = [np.full((3, 4), [5 + index, 1, 0, 0.5]) for index in range(2)]
+    places = [(49 + index * 6 / METRES_A_DEGREE, 8.4 + index * east, 110 + index) for index in range(2)]
+    poses = [" ".join(map(str, (*place, 0, 0, YAW, 1, 2, 3))) for place in places]
+    return write_raw_drive(tmp_path / "day", clouds, poses)
 
 
 def test_poses_follow_from_the_positions_on_the_ground(recording):

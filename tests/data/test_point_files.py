@@ -197,8 +197,7 @@ def test_a_viewpoint_that_cannot_be_applied_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("field", "told"),
-    [("i", False), ("Scalar_Intensity", False), ("signal", True), ("intensity_2", True)],
+    ("field", "told"), [("i", False), ("Scalar_Intensity", False), ("signal", True), ("intensity_2", True)]
 )
 def test_fields_like_an_intensity_are_read_or_told(tmp_path, capsys, field, told):
     path = save(tmp_path / "a.pcd", pcd_header("ascii", 1, f"x y z {field}") + b"5 2 -1 9\n")

@@ -9,6 +9,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from commands import wait_until
 from toy_frames import ToyFrames
 
 from fcos_lidar_jax.devices.feeding import feed
@@ -31,13 +32,6 @@ def host(step: int) -> HostBatch:
 
 def feed_threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name == "feed"]
-
-
-def wait_until(holds) -> None:
-    deadline = time.monotonic() + 20
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def test_batches_arrive_on_the_devices_in_order(mesh):

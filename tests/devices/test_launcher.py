@@ -1,9 +1,7 @@
 """Choice of the GPUs of a process from the variables of its launcher."""
 
-import socket
-
 import pytest
-from commands import run_python
+from commands import free_port, run_python
 
 from fcos_lidar_jax.devices.launcher import local_device_ids
 
@@ -63,9 +61,6 @@ def test_jax_hides_no_gpu_from_the_only_process_of_a_machine(tasks, visible):
         "jax.distributed.initialize(local_device_ids=ids(os.environ)); "
         "print(jax.config.read('jax_cuda_visible_devices'))"
     )
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = str(free.getsockname()[1])
     step = {"SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "1", "SLURM_PROCID": "0", STEP: tasks}
-    done = run_python("-c", code, **FIRST | step, JAX_COORDINATOR_PORT=port)
+    done = run_python("-c", code, **FIRST | step, JAX_COORDINATOR_PORT=free_port())
     assert done.stdout == f"{visible}\n", done.stderr

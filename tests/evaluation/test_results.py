@@ -218,6 +218,7 @@ def test_a_resume_log_survives_interruptions(tmp_path):
     with ResumeLog(file, "one") as resume_log:
         resume_log.add("a", [{"x": 1}])
         resume_log.add("b", [])
+        assert file.read_bytes().count(b"\n") == 3  # whole, should the process be killed now
     whole = file.read_bytes()
     for cut in range(len(whole)):
         file.write_bytes(whole[:cut])

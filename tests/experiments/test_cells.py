@@ -41,16 +41,11 @@ def test_committed_tables_are_those_of_their_cells_and_of_the_rows_of_today(tmp_
         assert as_markdown(table, again) == file.read_text(), file
 
 
-def test_cells_are_identified_by_their_changes():
-    changes = {"model__tied_heads": True, "projection__prioritize_current": False, "copy_paste": None}
-    changes |= {"class_ranges_m": (30.0,) * 10, "classes": tuple("abcdefghij")}
-    changes |= {"copy_paste__min_points": 6, "augment__scale_range": (0.9, 1.1)}
-    configs = [QUICKSTART, CENTERPOINT_COMPACT, change(pillars__min_radius=3)(CENTERPOINT_COMPACT)]
-    configs += [change(**{field: value})(QUICKSTART) for field, value in changes.items()]
-    names = {run_name(changes_of(config, QUICKSTART), seed) for config in configs for seed in (0, 1)}
-    assert len(names) == 2 * len(configs) == 20
-    assert max(map(len, names)) < 110
-    assert changes_of(change(name="other")(QUICKSTART), QUICKSTART) == "base"
+def test_long_names_are_cut_and_differ():
+    configs = CENTERPOINT_COMPACT, change(pillars__min_radius=3)(CENTERPOINT_COMPACT)
+    first, second = (run_name(changes_of(config, QUICKSTART), 0) for config in configs)
+    assert first != second
+    assert max(len(first), len(second)) < 110
 
 
 def test_a_cell_comes_back_as_it_was_and_others_stay(tmp_path):

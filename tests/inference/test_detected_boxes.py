@@ -86,11 +86,12 @@ def test_a_slice_holds_boxes(made):
     assert [(box.name, box.score) for box in made[3:5]] == [(made[i].name, made[i].score) for i in (3, 4)]
 
 
-def test_a_detector_takes_arrays_of_jax_and_lists_and_prints_in_one_line(detector):
-    points = make_frame(0, SENSOR).points
+def test_a_detector_takes_files_arrays_of_jax_and_lists_and_prints_in_one_line(detector, tmp_path):
+    points, file = make_frame(0, SENSOR).points, tmp_path / "cloud.npy"
+    np.save(file, points)
     expected = detector(points)
-    for same in (jax.numpy.asarray(points), points.tolist()):
-        np.testing.assert_array_equal(detector(same).boxes, expected.boxes)
+    for same in (file, str(file), jax.numpy.asarray(points), points.tolist()):
+        assert detector(same).to_dict()["boxes"] == expected.to_dict()["boxes"]
     assert repr(detector).startswith("TrainedDetector('quickstart', 'tiny', classes=('car', ")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, run_python
+from commands import command, run_python
 from linear_network import linear_network
 from refusal import refused
 from tiny_run import REFINED as CONFIG
@@ -60,15 +60,6 @@ def test_boxes_are_bit_identical_to_the_checkpoint(home):
         assert exported(points).to_dict() == trained(points).to_dict()
     assert exported.classes == trained.classes
     assert exported.sensor == trained.sensor
-
-
-@pytest.mark.optimised
-def test_detect_accepts_an_exported_detector_with_its_batch_size(home, tmp_path, capsys):
-    for name in ("checkpoint", "detector.fcos"):
-        command("detect", home / "cloud.npy", "--checkpoint", home / name, "--out", tmp_path / f"{name}.json")
-    assert (tmp_path / "checkpoint.json").read_bytes() == (tmp_path / "detector.fcos.json").read_bytes()
-    words = ["detect", str(home / "cloud.npy"), "--checkpoint", str(home / "detector.fcos"), "--batch-size", "2"]
-    assert_one_line_error(capsys, [*words, "--out", str(tmp_path / "a")], r"batch size: got 2, expected 1")
 
 
 @pytest.mark.optimised
@@ -124,29 +115,6 @@ def test_damaged_files_are_refused(home, tmp_path, damage, message):
     (tmp_path / "bad.fcos").write_bytes(damage((home / "detector.fcos").read_bytes()))
     with refused("bad.fcos: ", message):
         load_exported(tmp_path / "bad.fcos")
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        (
-            "detect HOME/cloud.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos",
-            "the place of the checkpoint",
-        ),
-        (
-            "stream HOME/cloud.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos",
-            "the place of the checkpoint",
-        ),
-        ("benchmark --checkpoint HOME/detector.fcos --out HOME/detector.fcos", "the place of the checkpoint"),
-        ("export --checkpoint HOME/checkpoint --out HOME/checkpoint/a", "the place of the checkpoint"),
-        ("export --checkpoint HOME/checkpoint --out HOME", "found a folder"),
-        ("export --checkpoint HOME/detector.fcos --out HOME/a", "found a file, expected a checkpoint folder"),
-    ],
-)
-def test_no_command_overwrites_its_detector(home, capsys, line, message):
-    before = sorted(home.rglob("*")), (home / "detector.fcos").read_bytes()
-    assert_one_line_error(capsys, line.replace("HOME", str(home)).split(), message)
-    assert before == (sorted(home.rglob("*")), (home / "detector.fcos").read_bytes())
 
 
 @pytest.fixture(scope="module")

@@ -126,14 +126,6 @@ def arrays(found):
     return bits((found.boxes, found.scores, found.labels))
 
 
-def test_a_detector_accepts_files(detector, tmp_path):
-    points, file = make_frame(0, SENSOR).points, tmp_path / "cloud.npy"
-    np.save(file, points)
-    found = detector(points)
-    assert len(found) > 0
-    assert arrays(detector(file)) == arrays(detector(str(file))) == arrays(found)
-
-
 @pytest.mark.parametrize("axes", ["lidar", "ray"])
 def test_centres_are_offset_along_the_axes_of_the_configuration(axes):
     """The network predicts the same everywhere: one class, and the centre one metre along the first axis."""
@@ -200,11 +192,3 @@ def test_detections_with_flips_are_equivariant_to_mirrored_clouds(detector):
     difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
     # Boxes with nearly equal scores may change places.
     assert (np.abs(difference).max(axis=1) < 1e-3).mean() > 0.9
-
-
-@pytest.mark.parametrize(("augment", "axis"), [(AugmentConfig(flip_y_probability=0.0), "y"), (None, "x")])
-def test_flips_without_the_same_augmentation_are_refused(augment, axis):
-    inference = dataclasses.replace(CONFIG.inference, flips="xy")
-    message = rf"inference.flips: got 'xy', expected augment.flip_{axis}_probability above 0"
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(CONFIG, augment=augment, inference=inference)

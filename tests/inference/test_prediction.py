@@ -9,7 +9,7 @@ import pytest
 from refusal import refused
 from tiny_run import FRAMES, TESTS
 
-from fcos_lidar_jax.data.frame import Frame, InMemoryFrames, WrappedFrames
+from fcos_lidar_jax.data.frame import Frame, WrappedFrames
 from fcos_lidar_jax.inference import prediction
 from fcos_lidar_jax.inference.prediction import evaluate, predict
 
@@ -26,16 +26,6 @@ def test_an_evaluation_does_not_keep_clouds(detector, compared):
     evaluate(detector, TESTS)
     assert [frame.points.shape for frame in compared] == 2 * [(0, 5)]
     assert all(frame.points.base is None for frame in compared), "a view of the whole cloud"
-
-
-def test_more_time_lags_than_the_detector_has_sweeps_are_refused(detector):
-    frame = FRAMES.frame(0)
-    points = frame.points.copy()
-    points[:, 4] = np.arange(len(points)) % 16 / 15
-    frames = InMemoryFrames((dataclasses.replace(frame, points=points),), FRAMES.sensor, FRAMES.classes)
-    for detect in (lambda: detector(points), lambda: next(predict(detector, frames))):
-        with refused("points: fifth column: got 16 different values up to 1, expected the time lag"):
-            detect()
 
 
 def test_missing_files_are_refused_before_a_frame_is_read(detector, monkeypatch):

@@ -79,8 +79,7 @@ def test_frames_without_usable_points_of_other_processes_are_counted(monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("options", "clouds", "again"),
-    [(None, "a", [0, 2]), ([0.5], "a", [0, 1, 2]), (None, "changed", [0, 1, 2])],
+    ("options", "clouds", "again"), [(None, "a", [0, 2]), ([0.5], "a", [0, 1, 2]), (None, "changed", [0, 1, 2])]
 )
 def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_before(
     monkeypatch, tmp_path, capsys, options, clouds, again

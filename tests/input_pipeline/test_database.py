@@ -2,29 +2,19 @@
 
 import dataclasses
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import oracles
 import pytest
-from commands import child_environment, contents
+from commands import contents, cut, flip
 from refusal import refused
 from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.files import checksum
-from fcos_lidar_jax.input_pipeline.database import (
-    objects_folder,
-    open_database,
-    prepare_database,
-    shards_by_scene,
-)
+from fcos_lidar_jax.input_pipeline.database import objects_folder, open_database, prepare_database, shards_by_scene
 from fcos_lidar_jax.sensors import ARGOVERSE2
 
 SCENES = (("scene-b", (0, 1, 2)), ("scene-a", (3,)), ("scene-c", (6, 4)))
@@ -208,53 +198,6 @@ def test_an_interrupted_build_has_no_manifest_and_resumes_to_the_same_bytes(
         assert before.items() <= stamps(tmp_path).items()  # finished shards are not written again
 
 
-def ends(group):
-    """Wait up to 10 s until a process group is gone; return whether it is."""
-    for _ in range(200):
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.05)
-    return False
-
-
-KILLED = """
-import sys
-from fcos_lidar_jax.input_pipeline.database import prepare_database
-from toy_frames import SceneFrames, ToyFrames
-if __name__ == "__main__":
-    scenes = tuple((f"scene-{i}", (i, i + 1)) for i in range(24))
-    prepare_database(SceneFrames(ToyFrames(25, 0.03), scenes), sys.argv[1], workers=2)
-"""
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_the_workers_and_the_build_resumes_to_the_same_bytes(tmp_path):
-    script = tmp_path / "build.py"
-    script.write_text(KILLED)
-    folder = tmp_path / "objects"
-    process = subprocess.Popen(
-        [sys.executable, script, folder],
-        env=child_environment(),
-        start_new_session=True,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 60
-    while len(list(folder.glob("*.npz"))) < 4 and time.monotonic() < deadline:
-        time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGINT)  # like a terminal, to the whole process group
-    error = process.communicate(timeout=60)[1]
-    assert 4 <= len(list(folder.glob("*.npz"))) < 24
-    assert not (folder / "manifest.json").exists()
-    assert error.count("Traceback") <= 1  # the workers print nothing
-    assert ends(process.pid)
-    for each in (folder, tmp_path / "whole"):
-        build(each, ToyFrames(25), scenes=tuple((f"scene-{i}", (i, i + 1)) for i in range(24)))
-    assert contents(folder) == contents(tmp_path / "whole")
-
-
 def test_a_build_from_other_data_replaces_the_old_shards(tmp_path):
     build(tmp_path / "a", source="old")
     (tmp_path / "a" / ".0123456789ab.f32").write_bytes(b"half")
@@ -262,16 +205,6 @@ def test_a_build_from_other_data_replaces_the_old_shards(tmp_path):
     build(tmp_path / "b", scenes=SCENES[:2], source="new", min_points=9)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     assert len(contents(tmp_path / "a")) == 5
-
-
-def flip(file, position):
-    data = bytearray(file.read_bytes())
-    data[position] ^= 1
-    file.write_bytes(data)
-
-
-def cut(file, size):
-    file.write_bytes(file.read_bytes()[:size])
 
 
 def edit(file, **changes):
@@ -286,11 +219,7 @@ DAMAGE = {
     "no manifest": (MANIFEST, Path.unlink, "no such file, expected a finished"),
     "truncated manifest": (MANIFEST, lambda f: cut(f, 100), "not JSON"),
     "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 5; rebuild it with"),
-    "path": (
-        MANIFEST,
-        lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]),
-        "name: got '/etc/x', expected",
-    ),
+    "path": (MANIFEST, lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]), "name: got '/etc/x', expected"),
     "few classes": (MANIFEST, lambda f: edit(f, classes=["car"]), "classes: got ['car'], expected at least "),
     "altered table": (TABLE, lambda f: flip(f, 700), "rebuild it with"),
     "truncated table": (TABLE, lambda f: cut(f, 700), "not a table of objects"),

@@ -6,14 +6,13 @@ import multiprocessing
 import os
 import shutil
 import signal
-import time
 from pathlib import Path
 
 import jax
 import numpy as np
 import oracles
 import pytest
-from commands import run_python
+from commands import run_python, wait_until
 from refusal import refused
 from toy_frames import ListedFrames, ToyFrames, toy_frame
 
@@ -77,13 +76,7 @@ def alone(objects):
     return batches
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        {"threads": 4, "first_step": 1},
-        {"first_step": STEPS},
-    ],
-)
+@pytest.mark.parametrize("how", [{"threads": 4, "first_step": 1}, {"first_step": STEPS}])
 def test_batches_do_not_depend_on_threads_or_the_first_step(objects, alone, how):
     assert_same(run(config=CONFIG, objects=objects, **how), alone[how.get("first_step", 0) :])
 
@@ -98,8 +91,7 @@ def test_the_rows_of_all_processes_form_the_global_batch(objects, alone):
 
 
 @pytest.mark.parametrize(
-    ("cores", "workers", "threads"),
-    [(1, 0, 1), (2, 0, 2), (3, 0, 2), (128, 0, 16), (32, 4, 4), (4, 16, 1)],
+    ("cores", "workers", "threads"), [(1, 0, 1), (2, 0, 2), (3, 0, 2), (128, 0, 16), (32, 4, 4), (4, 16, 1)]
 )
 def test_the_default_number_of_threads_depends_on_the_cores(monkeypatch, cores, workers, threads):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
@@ -333,8 +325,4 @@ def test_workers_end_when_the_main_process_is_killed(tmp_path):
     assert done.returncode == -signal.SIGKILL
     left = {int(number) for number in done.stdout.split()}
     assert left
-    deadline = time.monotonic() + 30
-    while left and time.monotonic() < deadline:
-        left = {number for number in left if Path(f"/proc/{number}").exists()}
-        time.sleep(0.05)
-    assert not left
+    wait_until(lambda: not any(Path(f"/proc/{number}").exists() for number in left), 30)

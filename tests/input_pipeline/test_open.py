@@ -1,6 +1,7 @@
-"""Opening data sets: recognition of formats, default splits, options of each format, one-line errors."""
+"""Opening data sets: recognition of formats, splits, options of each format, boxes without clouds, errors."""
 
 import dataclasses
+import json
 import os
 import pickle
 import shutil
@@ -13,19 +14,24 @@ from made_folder import CLASSES, make_folder
 from made_kitti import make_kitti
 from made_nuscenes import VERSION, make_tables, token, write
 from refusal import refused
+from toy_frames import toy_frame
 
+from experiments.cached import CachedFrames
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import kitti
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.class_mapping import MappedFrames
+from fcos_lidar_jax.data.clouds import CloudFiles
 from fcos_lidar_jax.data.folder import FolderFrames
+from fcos_lidar_jax.data.frame import InMemoryFrames, SelectedFrames
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.input_pipeline.open import READERS, default_split, find_data_set, open_frames
 from fcos_lidar_jax.input_pipeline.open import Format as FormatName
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY, VLP16, sector
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
 
@@ -62,6 +68,7 @@ def roots(tmp_path_factory):
 
 def test_every_format_is_tried_here(roots):
     assert roots.keys() == FORMATS.keys()
+    assert SETS.keys() >= set(get_args(FormatName))
     assert FORMATS.keys() | {"simulated"} == {reader.name for reader in READERS} == set(get_args(FormatName))
 
 
@@ -208,10 +215,7 @@ BAD = {
     "version of kitti": ({"root": "kitti", "version": "v1"}, "version: got v1, expected none"),
     "no such version": ({"root": "nuscenes", "version": "v9"}, "v9: no such folder, expected one of v1.0-made"),
     "full turn": ({"root": "argoverse2", "full_turn": True}, "full_turn: got True, expected none"),
-    "no scale": (
-        {"root": "folder", "intensity_scale": -2.0},
-        "intensity_scale: got -2.0, expected within",
-    ),
+    "no scale": ({"root": "folder", "intensity_scale": -2.0}, "intensity_scale: got -2.0, expected within"),
     "class map": (
         {"root": "kitti", "class_map": {"Lorry": "truck"}},
         "class map: got Lorry, expected classes of the data: Car, Van, ",
@@ -279,3 +283,90 @@ def test_default_splits(roots, tmp_path):
     assert split(root, "train") is None
     with refused("gone.json: no such file, expected splits"):
         split(root, "train", splits=root / "gone.json")
+
+
+def folder_with_sweeps(roots, place):
+    """The second frame has a list of two sweeps, of which the older one shows the same place."""
+    root = shutil.copytree(roots["folder"], place / "folder_with_sweeps")
+    older, lists = root / "older", root / "sweeps"
+    older.mkdir()
+    lists.mkdir()
+    shutil.copy(root / "clouds" / "001.npy", older)
+    files = ("../clouds/001.npy", 100_000), ("../older/001.npy", 0)
+    pose = np.eye(4).tolist()
+    sweeps = [{"file": file, "timestamp_us": time_us, "sensor_to_world": pose} for file, time_us in files]
+    (lists / "001.json").write_text(json.dumps(sweeps))
+    return open_frames(root, num_sweeps=2)
+
+
+def cached_frames(roots, place):
+    frames = CachedFrames(SimulatedFrames(TINY, 2, reading=CloudReading(2)), place)
+    frames.frame(0)  # The other one is made when its boxes are requested.
+    return frames
+
+
+def clouds(roots, place):
+    root = folder_with_sweeps(roots, place).root
+    return CloudFiles((root / "clouds" / "000.npy", root / "sweeps" / "001.json"), TINY, CloudReading(2))
+
+
+RENAMED = ("cyclist", "person"), {"pedestrian": "person"}
+SETS = {  # frames of every kind, from the data sets and an empty folder
+    "nuscenes": lambda roots, _: open_frames(roots["nuscenes"], num_sweeps=3),
+    "argoverse2": lambda roots, _: open_frames(roots["argoverse2"], num_sweeps=2),
+    "kitti": lambda roots, _: open_frames(roots["kitti"]),
+    "folder": folder_with_sweeps,
+    "simulated": lambda *_: SimulatedFrames(TINY, 2, reading=CloudReading(2)),
+    "in memory": lambda *_: InMemoryFrames((toy_frame(0), toy_frame(1)), TINY, ("car",) * 10),
+    "mapped": lambda roots, _: MappedFrames(open_frames(roots["nuscenes"], num_sweeps=3), *RENAMED),
+    "selected": lambda roots, _: SelectedFrames(open_frames(roots["kitti"]), (2, 0)),
+    "cached": cached_frames,
+    "clouds": clouds,
+}
+COUNTED = ("kitti", "folder", "simulated", "selected", "cached")  # from the clouds, by reader or simulation
+
+
+def assert_truth(found, frame):
+    for name in ("boxes", "labels", "num_points"):
+        ours, theirs = getattr(found, name), getattr(frame, name)
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_array_equal(ours, theirs)
+    assert found.points.shape == (0, frame.points.shape[1])
+    assert found.points.dtype == frame.points.dtype
+    assert found.points.base is None
+    assert found.num_close == 0
+
+
+@pytest.mark.parametrize("kind", SETS)
+def test_the_truth_has_the_boxes_of_the_frame_without_its_points(roots, tmp_path, kind):
+    frames = SETS[kind](roots, tmp_path)
+    truths = [frames.truth(index) for index in range(len(frames))]
+    assert sum(len(truth.boxes) for truth in truths) > 0 or kind == "clouds"
+    for index, truth in enumerate(truths):
+        assert_truth(truth, frames.frame(index))
+    if kind in COUNTED:
+        assert any((truth.num_points > 0).any() for truth in truths)
+
+
+@pytest.mark.parametrize("kind", ["nuscenes", "argoverse2", "mapped", "clouds"])
+def test_the_truth_is_read_without_the_clouds(roots, tmp_path, kind):
+    copies = {name: shutil.copytree(roots[name], tmp_path / name) for name in ("nuscenes", "argoverse2", "folder")}
+    frames = SETS[kind](copies, tmp_path)
+    expected = [frames.frame(index) for index in range(len(frames))]
+    for ending in ("*.bin", "*.npy", "lidar/*.feather"):
+        for file in tmp_path.rglob(ending):
+            file.unlink()
+    with pytest.raises((OSError, ValueError)):
+        frames.frame(0)
+    for index, frame in enumerate(expected):
+        assert_truth(frames.truth(index), frame)
+
+
+def test_the_truth_of_a_folder_reads_the_current_sweep_only(roots, tmp_path):
+    frames = folder_with_sweeps(roots, tmp_path)
+    expected = frames.frame(1)
+    assert len(np.unique(expected.points[:, 4])) == 2
+    (frames.root / "older" / "001.npy").write_bytes(b"no cloud")
+    with pytest.raises(ValueError, match="older/001"):
+        frames.frame(1)
+    assert_truth(frames.truth(1), expected)

@@ -89,11 +89,7 @@ def test_batches_of_gradients_and_gradients_of_batches(case):
 
 @pytest.mark.parametrize(
     ("size", "dilation", "circular", "dtype"),
-    [
-        ((3, 3), 3, False, "float32"),
-        ((3, 3), 2, True, "bfloat16"),
-        ((5, 3), 3, True, "float32"),
-    ],
+    [((3, 3), 3, False, "float32"), ((3, 3), 2, True, "bfloat16"), ((5, 3), 3, True, "float32")],
 )
 def test_weight_gradients_by_phases_are_the_librarys(size, circular, dilation, dtype):
     """Of sizes that the dilation divides and does not divide, as a GPU computes them."""

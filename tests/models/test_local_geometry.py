@@ -115,11 +115,6 @@ def test_offsets_between_rounds_are_their_definition_in_loops(rounds):
         assert len(np.unique(expected[..., 3::5])) > 9
 
 
-def test_offsets_of_later_rounds_belong_to_local_geometry():
-    with pytest.raises(ValueError, match="round_offsets: got True, expected False without local_geometry"):
-        dataclasses.replace(CONFIG.model, local_geometry=False, round_offsets=True)
-
-
 def own_by_loops(image, rounds: int):
     """Channels of the first round by name, pixel by pixel."""
     names = "z", "range", "inclination", "intensity", "existence"

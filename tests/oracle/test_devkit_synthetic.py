@@ -1,4 +1,4 @@
-"""The official devkit reads synthetic data sets: tables, fused sweeps, evaluation."""
+"""The official devkit has the same splits, and reads synthetic data sets: tables, fused sweeps, evaluation."""
 
 import itertools
 import json
@@ -11,6 +11,7 @@ from made_evaluation import devkit_summary
 from fcos_lidar_jax.cli.synthesize import Synthesize, run
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
+from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.evaluation.results import LIDAR_META
 
 pytestmark = pytest.mark.slow
@@ -32,6 +33,14 @@ def official(root):
     from nuscenes import NuScenes as Official
 
     return Official(VERSION, str(root), verbose=False)
+
+
+def test_official_splits_equal_the_devkits():
+    from nuscenes.utils import splits as theirs
+
+    splits = official_splits()
+    assert list(splits) == ["train", "val", "test", "mini_train", "mini_val"]
+    assert splits == {name: getattr(theirs, name) for name in splits}
 
 
 def test_the_devkit_loads_every_table(official):

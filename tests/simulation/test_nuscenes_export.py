@@ -2,11 +2,6 @@
 
 import dataclasses
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -163,35 +158,6 @@ def test_killed_runs_resume_to_the_same_bytes(tmp_path):
             assert contents(root / VERSION) == contents(whole / VERSION)
         assert contents(synthesize(root, *quick)) == contents(whole)
     assert len(states) >= 4  # kills at different stages
-
-
-@pytest.mark.slow
-def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, tmp_path):
-    root = tmp_path / "data"
-    started = [sys.executable, "-m", "fcos_lidar_jax", *command(root, "--workers", "2")]
-    with subprocess.Popen(started, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        until = time.monotonic() + 60
-        while not list(root.rglob("*.bin")) and time.monotonic() < until:
-            time.sleep(0.02)
-        os.kill(process.pid, signal.SIGKILL)
-    time.sleep(0.5)
-    before = contents(root)
-    time.sleep(0.5)
-    assert contents(root) == before  # no process writes any more
-    assert contents(synthesize(root)) == contents(made)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--scenes 0", "--scenes: got 0, expected at least 1"),
-        ("--seed -1", "--seed: got -1, expected at least 0"),
-        ("--version samples", "--version: got 'samples', expected a name for the folder of the tables"),
-    ],
-)
-def test_invalid_options_get_one_line(options, message, tmp_path, capsys):
-    assert message in refusal(capsys, tmp_path / "new", *options.split())
-    assert not (tmp_path / "new").exists()
 
 
 def test_folders_with_other_contents_are_refused(made, tmp_path, capsys):

@@ -3,8 +3,11 @@
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,31 @@ def command(*args: object) -> None:
 def contents(folder: Path) -> dict[str, bytes]:
     """All files below a folder, by relative path."""
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def cut(file: Path, size: int) -> None:
+    """Leave only the first bytes of a file; a negative size counts from its end."""
+    file.write_bytes(file.read_bytes()[:size])
+
+
+def flip(file: Path, position: int) -> None:
+    """Change one bit of a byte of a file."""
+    content = bytearray(file.read_bytes())
+    content[position] ^= 1
+    file.write_bytes(content)
+
+
+def free_port() -> str:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return str(free.getsockname()[1])
+
+
+def wait_until(holds: Callable[[], object], seconds: float = 200) -> None:
+    until = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 def page_content(path: Path) -> dict[str, Any]:

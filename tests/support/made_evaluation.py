@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_nuscenes import pose
+from made_nuscenes import pose, write
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -166,11 +166,8 @@ def _predictions(
 
 def write_task(root: Path, tables: Tables, results: dict[str, Any]) -> Path:
     """Write the tables and ``results.json``; returns the data root."""
-    files = {f"{VERSION}/{name}.json": rows for name, rows in tables.items()}
-    files |= {f"{VERSION}/splits.json": {SPLIT: list(SCENES)}, "results.json": results}
-    (root / VERSION).mkdir(parents=True)
-    for name, value in files.items():
-        (root / name).write_text(json.dumps(value))
+    write(root, tables, {}, VERSION, **{SPLIT: list(SCENES)})
+    (root / "results.json").write_text(json.dumps(results))
     (root / "maps").mkdir()
     (root / "maps" / "e.png").touch()
     return root

@@ -1,5 +1,6 @@
 """A small simulated data set in the layout of KITTI, and the texts of its files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,3 +74,16 @@ def make_kitti(
         write(training / "label_2" / f"{name}.txt", "".join(lines))
         write(training / "calib" / f"{name}.txt", calibration_text())
     return root
+
+
+def write_raw_drive(day: Path, clouds: Sequence[np.ndarray], poses: Sequence[str]) -> Path:
+    """Write a raw recording, whose sweeps are a tenth of a second apart, with the calibration of its day."""
+    drive = day / "drive"
+    (drive / "velodyne_points" / "data").mkdir(parents=True)
+    for index, (points, words) in enumerate(zip(clouds, poses, strict=True)):
+        points.astype(np.float32).tofile(drive / f"velodyne_points/data/{index:010d}.bin")
+        write(drive / f"oxts/data/{index:010d}.txt", words)
+    stamps = (f"2011-09-26 13:02:25.{5 + index}94360375\n" for index in range(len(clouds)))
+    write(drive / "velodyne_points" / "timestamps.txt", "".join(stamps))
+    write(day / "calib_imu_to_velo.txt", "calib_time: 25-May-2012\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n")
+    return drive

@@ -90,15 +90,17 @@ def make_tables(scenes: int = 2, seed: int = 0) -> tuple[dict[str, list[dict[str
     return tables, clouds
 
 
-def write(root: Path, tables: dict[str, Any], clouds: dict[str, np.ndarray]) -> Path:
-    """Write the data root, with a split per scene and a split of all scenes."""
-    folder = root / VERSION
+def write(
+    root: Path, tables: dict[str, Any], clouds: dict[str, np.ndarray], version: str = VERSION, **own: list[str]
+) -> Path:
+    """Write the data root with its own splits, or with a split per scene and a split of all scenes."""
+    folder = root / version
     folder.mkdir(parents=True)
     for name, rows in tables.items():
         (folder / f"{name}.json").write_text(json.dumps(rows, indent=0))
     scenes = [row["name"] for row in tables["scene"]]
     splits = {"all": scenes, **{scene: [scene] for scene in scenes}, "none": [], "lost": ["scene-99"]}
-    (folder / "splits.json").write_text(json.dumps(splits))
+    (folder / "splits.json").write_text(json.dumps(own or splits))
     for file, points in clouds.items():
         (root / file).parent.mkdir(parents=True, exist_ok=True)
         points.tofile(root / file)

@@ -21,6 +21,7 @@ from unittest.mock import Mock
 import jax
 import numpy as np
 import pytest
+from commands import contents, cut
 from event_files import summaries
 from linear_network import linear_network
 from PIL import Image
@@ -88,53 +89,36 @@ def checkpoint_names(folder: Path) -> list[str]:
     return sorted(path.name for path in (folder / "checkpoints").glob("*"))
 
 
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_a_step_is_compiled_once(finished):
     _, state, traces, _ = finished
     assert int(state.step) == STEPS
     assert traces == 1
 
 
-def test_initial_weights_of_another_coding_are_reported(finished, capsys):
-    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, regression_axes="ray"))
-    plan._initial_weights(build_detector(config, SENSOR), finished[0])
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("weights of model.regression_axes 'lidar', to be trained with 'ray'")
-
-
-OTHERS = {  # what differs from the sensor of the weights, and the warning
-    "name": ({"name": "mine", "limit_xy_m": 20.0}, None),
-    "heading": (
-        {"forward_rad": SENSOR.forward_rad - np.pi / 2},
-        "on clouds rotated by 90 degrees relative to these: ",
-    ),
-    "place": ({"origin_m": (1.4, 0, 1.6)}, r"with the LiDAR at \(0.0, 0.0, 0.0\) m, here at \(1.4, 0, 1.6\) m: "),
-    "columns": ({"num_columns": 128}, r"for sensor 'tiny' .*, here sensor 'tiny' \(16 beams, 128 columns\): the"),
+RAY = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, regression_axes="ray"))
+REVERSED = dataclasses.replace(CONFIG, classes=NUSCENES_CLASSES[::-1])
+TRAINED = "^warning: .*: weights trained"
+OTHERS = {  # what differs from the network and the sensor of the weights, and what is told
+    "coding": (RAY, {}, "weights of model.regression_axes 'lidar', to be trained with 'ray'$"),
+    "classes": (REVERSED, {}, r"these start with random weights: predictions \(2 of 2 arrays\)"),
+    "name": (CONFIG, {"name": "mine", "limit_xy_m": 20.0}, None),
+    "heading": (CONFIG, {"forward_rad": SENSOR.forward_rad - np.pi / 2}, f"{TRAINED} on clouds rotated by 90 deg"),
+    "place": (CONFIG, {"origin_m": (1.4, 0, 1.6)}, rf"{TRAINED} .*\(0.0, 0.0, 0.0\) m, here at \(1.4, 0, 1.6\)"),
+    "columns": (CONFIG, {"num_columns": 128}, rf"{TRAINED} .*, here sensor 'tiny' \(16 beams, 128 columns\): the"),
     "beams": (
-        {"name": "few", "inclinations_rad": SENSOR.inclinations_rad[::2]},
-        r"for sensor 'tiny' \(16 beams, 64 columns\), here sensor 'few' \(8 beams, 64 columns\): ",
+        *(CONFIG, {"name": "few", "inclinations_rad": SENSOR.inclinations_rad[::2]}),
+        rf"{TRAINED} for sensor 'tiny' \(16 beams, 64 columns\), here sensor 'few' \(8 beams, 64 columns\): ",
     ),
 }
 
 
 @pytest.mark.parametrize("other", OTHERS)
-def test_initial_weights_of_another_sensor_are_reported(finished, capsys, other):
-    changes, message = OTHERS[other]
-    plan._initial_weights(build_detector(CONFIG, dataclasses.replace(SENSOR, **changes)), finished[0])
+def test_initial_weights_of_another_network_or_sensor_are_reported(finished, capsys, other):
+    config, changes, message = OTHERS[other]
+    plan._initial_weights(build_detector(config, dataclasses.replace(SENSOR, **changes)), finished[0])
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == (message is not None)
-    assert all(re.search(f"^warning: .*: weights trained {message}", line) for line in lines)
-
-
-def test_initial_weights_for_other_classes_are_taken_where_they_fit(finished, capsys):
-    detector = build_detector(dataclasses.replace(CONFIG, classes=NUSCENES_CLASSES[::-1]), SENSOR)
-    given, taken = load_checkpoint(finished[0]).variables, plan._initial_weights(detector, finished[0])
-    assert bits(given["params"]["norm"]) == bits(taken["params"]["norm"])
-    assert bits(given["params"]["predictions"]) != bits(taken["params"]["predictions"])
-    assert "these start with random weights: predictions (2 of 2 arrays)" in capsys.readouterr().err
+    assert all(re.search(message, line) for line in lines)
 
 
 def test_initial_weights_in_half_precision_are_trained_in_float32():
@@ -274,8 +258,7 @@ def limits():
 
 
 def cut_description(folder: Path) -> None:
-    newest = folder / "checkpoints" / "00000003" / "checkpoint.json"
-    newest.write_text(newest.read_text()[:-9])
+    cut(folder / "checkpoints" / "00000003" / "checkpoint.json", -9)
 
 
 def half_saved(folder: Path) -> None:
@@ -363,30 +346,31 @@ def test_a_run_that_is_killed_in_its_only_save_begins_again(finished, begun):
     assert checkpoint_names(begun) == ["00000004"]
 
 
-def test_processes_with_other_data_are_refused_before_the_run_starts(tmp_path, monkeypatch):
-    def refuse(checksum, what):
-        checksums.append(checksum)
-        raise ValueError(f"process 1: {what}")
+def let_others_differ(monkeypatch, of: str) -> list:
+    """Let another process have other data ``of`` some kind; returns the checksums of this process."""
 
-    checksums = []
-    monkeypatch.setattr(runs, "check_same", refuse)
-    one_frame = {"frames": InMemoryFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)}
-    for options in (one_frame, {}, {}):
-        with pytest.raises(ValueError, match=r"^process 1: configuration or data$"):
-            train_tiny(tmp_path / "run", **options)
-    assert len(set(checksums)) == 2
-    assert checksums[1] == checksums[2]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_processes_that_find_other_checkpoints_are_refused(finished, tmp_path, monkeypatch):
-    def refuse(checksum, what):
-        if what == "checkpoint to resume from":
+    def check_same(checksum, what):
+        if what == of:
             checksums.append(checksum)
             raise ValueError(f"process 1: {what}")
 
     checksums = []
-    monkeypatch.setattr(runs, "check_same", refuse)
+    monkeypatch.setattr(runs, "check_same", check_same)
+    return checksums
+
+
+def test_processes_with_other_data_are_refused_before_the_run_starts(tmp_path, monkeypatch):
+    checksums = let_others_differ(monkeypatch, "configuration or data")
+    one_frame = {"frames": InMemoryFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)}
+    for options in (one_frame, {}, {}):
+        with pytest.raises(ValueError, match=r"^process 1: configuration or data$"):
+            train_tiny(tmp_path / "run", **options)
+    assert checksums[0] != checksums[1] == checksums[2]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_processes_that_find_other_checkpoints_are_refused(finished, tmp_path, monkeypatch):
+    checksums = let_others_differ(monkeypatch, "checkpoint to resume from")
     done, new = shutil.copytree(finished[0], tmp_path / "done"), tmp_path / "new"
     for folder, options in ((done, {"resume": True}), (new, {}), (new, {"resume": True})):
         with pytest.raises(ValueError, match=r"^process 1: checkpoint to resume from$"):

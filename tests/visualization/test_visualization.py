@@ -178,9 +178,7 @@ def test_rows_are_labelled_with_the_inclination_of_their_points():
 
 
 @pytest.mark.parametrize(
-    "series",
-    [{}, {"a": [], "b": [(1, float("nan")), (2, 0), (3, -1)], "c": [(1, 1)] * 99}],
-    ids=["none", "gaps"],
+    "series", [{}, {"a": [], "b": [(1, float("nan")), (2, 0), (3, -1)], "c": [(1, 1)] * 99}], ids=["none", "gaps"]
 )
 def test_empty_and_incomplete_curves_are_drawn(tmp_path, series):
     draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=True)
