@@ -15,6 +15,8 @@ from typing import Any
 
 import msgspec
 
+_MAX_TEXT = 1000  # of an exception, in characters
+
 
 def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
     """Write to a temporary file beside ``path`` and rename it, so that no reader sees a partial file.
@@ -83,6 +85,19 @@ class FileState(msgspec.Struct, frozen=True):
         if (stat.st_size, stat.st_mtime_ns, stat.st_ino) == (self.bytes, self.mtime_ns, self.inode):
             return True
         return stat.st_size == self.bytes and file_checksum(file) == self.blake2b
+
+
+@contextlib.contextmanager
+def refusing(
+    where: str, *kinds: type[Exception], kind: type[Exception] = ValueError, more: str = ""
+) -> Iterator[None]:
+    """Raise exceptions of ``kinds``, by default all, again: as one line of ``kind`` that begins with ``where``."""
+    caught = kinds or (Exception,)
+    try:
+        yield
+    except caught as error:
+        text = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())[:_MAX_TEXT]
+        raise kind(f"{where}{': ' if where else ''}{text}{more}") from None
 
 
 @contextlib.contextmanager
@@ -198,12 +213,8 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     """
     if not local_path(path).is_file():
         raise ValueError(f"{path}: no such file, expected {what}")
-    try:
+    with refusing(f"{path}: cannot be read", OSError), refusing(f"{path}: not JSON", ValueError, RecursionError):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not JSON: {error}") from None
     try:
         return msgspec.convert(content, kind)
     except (msgspec.ValidationError, OverflowError, UnicodeError) as error:  # huge integers, lone surrogates

@@ -4,15 +4,14 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fcos_lidar_jax.data.npy_files import npz_names, parse_npy, parse_npz
+from fcos_lidar_jax.data.npy_files import parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.files import local_path
+from fcos_lidar_jax.files import local_path, refusing
 from fcos_lidar_jax.sensors import Sensor
 
 ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # supported names, the longest first
@@ -89,18 +88,14 @@ def read_points(
         table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)
         return assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
     content, max_bytes = _read_whole(path, max_points), max_points * BYTES_PER_POINT
-    try:
+    with refusing(f"{path}: not a readable {kind} file", ValueError):
         if kind == ".pcd":
             limits = {"max_points": max_points, "max_bytes": max_bytes}
             parsed = parse_pcd(content, str(path), **limits, viewpoint=viewpoint)
         elif kind == ".npy":
             parsed = parse_npy(content, max_rows=max_points)
         else:
-            names = npz_names(content)
-            name = names[0] if len(names) == 1 else "points"
-            parsed = parse_npz(content, [name], max_rows=max_points, max_bytes=max_bytes)[name]
-    except ValueError as error:
-        raise ValueError(f"{path}: not a readable {kind} file: {error}") from None
+            parsed = parse_npz(content, ["points"], max_rows=max_points, max_bytes=max_bytes)["points"]
     if isinstance(parsed, dict):
         return assemble_points(path, sensor, parsed, num_sweeps)
     return points_from_array(parsed, sensor, str(path), num_sweeps)
@@ -176,29 +171,23 @@ def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_PO
         how = "pip install -e '.[argoverse2]' in the repository"
         raise ValueError(f"{path}: pyarrow is not installed, which reads .feather: {how}") from None
     content = _read_whole(path, max_rows)
-    try:
-        return _read_columns(pyarrow, content, kinds, max_rows)
-    except Exception as error:  # corrupt files raise arbitrary exceptions
-        raise ValueError(f"{path}: not a readable .feather file: {' '.join(str(error).split())}") from None
-
-
-def _read_columns(pyarrow: Any, content: bytes, kinds: Mapping[str, str], max_rows: int) -> dict[str, np.ndarray]:
-    reader, batches, num_rows, columns = pyarrow.ipc.open_file(content), [], 0, {}
-    for i in range(reader.num_record_batches):
-        batches.append(reader.get_batch(i))
-        num_rows += batches[-1].num_rows
-        if num_rows > max_rows:
-            raise ValueError(f"got more than {max_rows} rows, expected at most {max_rows}")
-    table = pyarrow.Table.from_batches(batches, reader.schema)
-    for name, kind in kinds.items():
-        column = table.column(name)
-        column.validate(full=True)  # crafted files may contain wrong offsets and lengths
-        columns[name] = values = column.to_numpy()
-        fits = values.dtype.kind in kind and (kind != "O" or all(isinstance(text, str) for text in values))
-        if column.null_count or not fits:
-            got = f"{column.null_count} rows without a value" if column.null_count else column.type
-            expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
-            raise ValueError(f"{name}: got {got}, expected {expected}")
+    with refusing(f"{path}: not a readable .feather file"):  # corrupt files raise arbitrary exceptions
+        reader, batches, num_rows, columns = pyarrow.ipc.open_file(content), [], 0, {}
+        for i in range(reader.num_record_batches):
+            batches.append(reader.get_batch(i))
+            num_rows += batches[-1].num_rows
+            if num_rows > max_rows:
+                raise ValueError(f"got more than {max_rows} rows, expected at most {max_rows}")
+        table = pyarrow.Table.from_batches(batches, reader.schema)
+        for name, kind in kinds.items():
+            column = table.column(name)
+            column.validate(full=True)  # crafted files may contain wrong offsets and lengths
+            columns[name] = values = column.to_numpy()
+            fits = values.dtype.kind in kind and (kind != "O" or all(isinstance(text, str) for text in values))
+            if column.null_count or not fits:
+                got = f"{column.null_count} rows without a value" if column.null_count else column.type
+                expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
+                raise ValueError(f"{name}: got {got}, expected {expected}")
     return columns
 
 
@@ -213,13 +202,11 @@ def check_inside(file: Path, folder: Path, where: str) -> None:
 def _read_whole(path: Path, max_points: int) -> bytes:
     """The bytes of a file, which may be at most as large as a cloud."""
     limit = max_points * BYTES_PER_POINT + _HEADER_BYTES
-    try:
+    with refusing(f"{path}: cannot be read", OSError):
         size = path.stat().st_size
         if size > limit:
             raise ValueError(f"{path}: got {size} bytes, expected at most {limit} for {max_points} points")
         content = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     if not content:
         raise ValueError(f"{path}: empty file, expected points")
     return content

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.data.sweeps import is_rotation
+from fcos_lidar_jax.files import refusing
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -17,10 +18,8 @@ def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
     """
     if not file.is_file():
         raise ValueError(f"{file}: no such file, expected {what}")
-    try:
+    with refusing(f"{file}: expected {what}", UnicodeDecodeError):
         lines = file.read_text(encoding="utf-8-sig").splitlines()  # Windows editors write a byte order mark
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{file}: got {error.reason} at byte {error.start}, expected {what}") from None
     rows = ((f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1))
     return [(where, words) for where, words in rows if words]
 

@@ -186,7 +186,7 @@ BAD = {
     "type": (L, label(kind="Bicycle"), "line 2: type: got 'Bicycle', expected Car"),
     "NaN": (L, label(ry="nan"), "line 2: rotation_y: got 'nan', expected a finite number"),
     "absurd place": (L, label(z="1e30"), "line 2: z: got 1e+30, expected at most 10000"),
-    "no text": (L, b"\xff\xfe", "got invalid start byte at byte 0, expected text"),
+    "no text": (L, b"\xff\xfe", "expected text: 'utf-8' codec can't decode byte 0xff in position 0"),
     "no label": (L, None, "no such file, expected one for every cloud"),
     "no calibration": (C, None, "no such file, expected one for every cloud"),
     "no matrix": (C, calibration_text().replace("R0_rect", "R1_rect"), "R0_rect: missing, expected P2, R0_rect"),

@@ -285,7 +285,11 @@ MANIFEST, TABLE, POINTS = "manifest.json", "scene-b.objects.npz", "scene-c.point
 DAMAGE = {
     "no manifest": (MANIFEST, Path.unlink, "no such file, expected a finished"),
     "truncated manifest": (MANIFEST, lambda f: cut(f, 100), "not JSON"),
-    "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 5; rebuild it with"),
+    "older version": (
+        MANIFEST,
+        lambda f: edit(f, version=2),
+        "$.version: got 2, expected int >= 5; rebuild it with",
+    ),
     "path": (
         MANIFEST,
         lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]),
