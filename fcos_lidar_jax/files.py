@@ -1,8 +1,9 @@
-"""Atomic writes, locks between processes, checked JSON and checksums of files."""
+"""Atomic writes, locks between processes, checked JSON, checksums of files, and packages of extras."""
 
 import contextlib
 import fcntl
 import hashlib
+import importlib
 import json
 import os
 import re
@@ -120,6 +121,31 @@ def local_path(path: str | Path) -> Path:
     return Path(path)
 
 
+def expect_file(path: Path, what: str) -> None:
+    """Refuse a path at which there is no file; ``what`` describes the expected one."""
+    if not os.path.isfile(path):
+        found = "found a folder" if os.path.isdir(path) else "no such file"
+        raise ValueError(f"{path}: {found}, expected {what}")
+
+
+def some_files(folder: Path, ending: str, what: str) -> list[Path]:
+    """The files in a folder whose names have an ending, sorted; refuses a folder without any, where ``what`` is
+    expected.
+    """
+    if not (files := sorted(folder.glob(f"*{ending}"))):
+        raise ValueError(f"{folder}: no {ending} file in it, expected {what}")
+    return files
+
+
+def import_extra(name: str, extra: str, before: str = "") -> Any:
+    """Import a package that an extra of this one installs; ``before`` begins the message if it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        how = f"pip install -e '.[{extra}]' in the repository"
+        raise ValueError(f"{before}{name} is not installed: {how}") from None
+
+
 def check_writable(path: Path) -> None:
     """Reject a path at which :func:`atomic_write` would fail, as far as this is known without writing."""
     _check_kind(path)
@@ -211,8 +237,7 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     Traceback (most recent call last):
     ValueError: ...a.json: $[1]: got 3, expected str
     """
-    if not local_path(path).is_file():
-        raise ValueError(f"{path}: no such file, expected {what}")
+    expect_file(local_path(path), what)
     with refusing(f"{path}: cannot be read", OSError), refusing(f"{path}: not JSON", ValueError, RecursionError):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     try:

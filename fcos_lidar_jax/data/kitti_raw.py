@@ -10,7 +10,7 @@ from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import FARTHEST_M, Sweep
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
-from fcos_lidar_jax.files import refusing
+from fcos_lidar_jax.files import refusing, some_files
 from fcos_lidar_jax.sensors import Sensor
 
 _EARTH_RADIUS_M = 6_378_137.0
@@ -32,9 +32,7 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
     first latitude, as in the data set's development kit.
     """
     points = folder / "velodyne_points"
-    files = sorted(points.joinpath("data").glob("*.bin"))
-    if not files:
-        raise ValueError(f"{points / 'data'}: no .bin file in it, expected sweeps")
+    files = some_files(points / "data", ".bin", "sweeps")
     times = dict(read_lines(points / "timestamps.txt", "the times of the sweeps"))
     own, of_day = folder / _CALIBRATION, folder.absolute().parent / _CALIBRATION
     matrices = read_matrices(own if own.is_file() else of_day, {"R": (3, 3), "T": (3, 1)}, ("R",))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from fcos_lidar_jax.data.npy_files import parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.files import local_path, refusing
+from fcos_lidar_jax.files import expect_file, import_extra, local_path, refusing
 from fcos_lidar_jax.sensors import Sensor
 
 ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # supported names, the longest first
@@ -165,11 +165,7 @@ def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_PO
     ``kinds`` maps columns to NumPy's letters of the allowed types: ``"fiu"`` numbers, ``"iu"`` whole numbers,
     ``"O"`` texts. Rows without a value are refused.
     """
-    try:
-        import pyarrow
-    except ImportError:
-        how = "pip install -e '.[argoverse2]' in the repository"
-        raise ValueError(f"{path}: pyarrow is not installed, which reads .feather: {how}") from None
+    pyarrow = import_extra("pyarrow", "argoverse2", f"{path}: ")
     content = _read_whole(path, max_rows)
     with refusing(f"{path}: not a readable .feather file"):  # corrupt files raise arbitrary exceptions
         reader, batches, num_rows, columns = pyarrow.ipc.open_file(content), [], 0, {}
@@ -191,10 +187,9 @@ def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_PO
     return columns
 
 
-def check_inside(file: Path, folder: Path, where: str) -> None:
-    """Refuse a file that a link or ``..`` leads out of a folder; ``where`` names it in the message."""
-    real = os.path.realpath(file)
-    if not Path(real).is_relative_to(os.path.realpath(folder)):
+def check_inside(file: Path, folder: Path | None, where: str) -> None:
+    """Refuse a file that a link or ``..`` leads out of a folder, if any; ``where`` names it in the message."""
+    if folder and not Path(real := os.path.realpath(file)).is_relative_to(os.path.realpath(folder)):
         found = f"resolves to {real}, expected a file inside {folder}"
         raise ValueError(f"{where}: {found}; --follow-links allows links that lead out")
 
@@ -214,9 +209,7 @@ def _read_whole(path: Path, max_points: int) -> bytes:
 
 def _kind(path: Path, *, raw: bool) -> str:
     """The file's extension among :data:`ENDINGS`; with ``raw`` any other name counts as ``.bin``."""
-    if not os.path.isfile(path):
-        found = "found a folder" if os.path.isdir(path) else "no such file"
-        raise ValueError(f"{path}: {found}, expected a point file")
+    expect_file(path, "a point file")
     for ending in ENDINGS:
         if path.name.lower().endswith(ending):
             return ending

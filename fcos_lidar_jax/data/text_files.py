@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.data.sweeps import is_rotation
-from fcos_lidar_jax.files import refusing
+from fcos_lidar_jax.files import expect_file, refusing
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -16,8 +16,7 @@ def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
 
     ``what`` describes the expected file, if there is none or it is not text.
     """
-    if not file.is_file():
-        raise ValueError(f"{file}: no such file, expected {what}")
+    expect_file(file, what)
     with refusing(f"{file}: expected {what}", UnicodeDecodeError):
         lines = file.read_text(encoding="utf-8-sig").splitlines()  # Windows editors write a byte order mark
     rows = ((f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1))

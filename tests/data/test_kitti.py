@@ -57,9 +57,7 @@ def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, c
     np.testing.assert_array_equal(in_camera(Path(file.name), points), cropped)
     calibration = root / "training" / "calib" / "000003.txt"
     calibration.unlink()
-    with pytest.raises(
-        ValueError, match=r"calib/000003\.txt: found nothing, expected the calibration of .*000003"
-    ):
+    with pytest.raises(ValueError, match=r"calib/000003\.txt: no such file, expected the calibration of .*000003"):
         in_camera(file.with_name("000003.bin"), points)
     calibration.parent.rename(root / "elsewhere")
     for other in (file.with_name("000003.bin"), root / "000007.bin"):
