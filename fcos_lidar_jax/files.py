@@ -19,23 +19,27 @@ import msgspec
 _MAX_TEXT = 1000  # of an exception, in characters
 
 
-def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
+def atomic_write(path: str | Path, content: str | bytes | Callable[[Path], object]) -> None:
     """Write to a temporary file beside ``path`` and rename it, so that no reader sees a partial file.
 
     A failure or an interruption leaves the old file unchanged and removes the temporary file. Missing parent
-    folders are created. ``write`` gets the temporary path, which has the extension of ``path``.
+    folders are created. ``content`` is text, bytes, or a function that writes to the temporary path, which has the
+    extension of ``path``.
 
     Raises:
-        OSError: ``path`` is a folder, a link or a device, or the file system or ``write`` raised it.
+        OSError: ``path`` is a folder, a link or a device, or the file system or ``content`` raised it.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "new" / "a.txt"
-    >>> atomic_write(file, lambda temporary: temporary.write_text("whole"))
+    >>> atomic_write(file, "whole")
     >>> file.read_text(), [f.name for f in file.parent.iterdir()]
     ('whole', ['a.txt'])
     """
     with atomic_path(path) as temporary:
-        write(temporary)
+        if isinstance(content, str | bytes):
+            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        else:
+            content(temporary)
 
 
 @contextlib.contextmanager
@@ -159,14 +163,9 @@ def check_writable(path: Path) -> None:
 def _check_kind(path: Path) -> None:
     """Reject URLs, and what a file must not replace: folders, devices, and links, whose targets would remain."""
     local_path(path)
-    found = None
-    if path.is_symlink():
-        found = f"a link to {path.readlink()}"
-    elif path.is_dir():
-        found = "a folder"
-    elif path.exists() and not path.is_file():
-        found = "a device or a pipe"
-    if found:
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        found = "a folder" if path.is_dir() else "a device or a pipe"
+        found = f"a link to {path.readlink()}" if path.is_symlink() else found
         raise FileExistsError(f"{path}: found {found}, expected a file to write")
 
 

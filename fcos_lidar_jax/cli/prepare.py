@@ -1,5 +1,6 @@
 """``fcos-lidar prepare``: the ground-truth database for copy-paste, and the index of nuScenes' tables."""
 
+import collections
 import dataclasses
 import json
 import re
@@ -108,14 +109,7 @@ def _make_index(tables: Path, folder: Path) -> Index:
     for left_over in folder.glob(".*"):
         if re.fullmatch(r"\.[0-9a-f]{12}\.(npy|json)", left_over.name):  # of a killed process
             left_over.unlink()
-    began = last = time.monotonic()
-
-    def report(file: str, rows: int) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now > last + 5:
-            last = now
-            tell(f"{file}: {rows} rows, {now - began:.0f} s")
-
-    save_index(build_index(tables, report), folder, tables=tables)
+    progress = collections.defaultdict[str, Progress](lambda: Progress("rows", None, every_s=5.0))
+    index = build_index(tables, lambda file, rows: progress[file].show(rows, file))
+    save_index(index, folder, tables=tables)
     return open_index(folder, tables=tables)

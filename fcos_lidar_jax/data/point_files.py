@@ -277,17 +277,13 @@ def assemble_points(
         lag = f"{points[negative[0], 4]:g} in row {negative[0]}"
         raise ValueError(f"{where}: time_lag: got {lag}, expected seconds of at least 0")
     if sensor.row_source == "laser":
-        points[:, 5] = _laser_numbers(where, sensor, table)
+        if "laser" not in table:
+            expected = f"one for every point, since sensor {sensor.name} needs it"
+            raise ValueError(f"{where}: no laser number in it, expected {expected}")
+        laser = table["laser"].astype(np.float64)
+        bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
+        if len(bad):
+            expected = f"whole numbers of 0 to {sensor.num_rows - 1}"
+            raise ValueError(f"{where}: laser number: got {laser[bad[0]]:g} in row {bad[0]}, expected {expected}")
+        points[:, 5] = laser
     return points
-
-
-def _laser_numbers(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
-    if "laser" not in table:
-        expected = f"one for every point, since sensor {sensor.name} needs it"
-        raise ValueError(f"{where}: no laser number in it, expected {expected}")
-    laser = table["laser"].astype(np.float64)
-    bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
-    if len(bad):
-        expected = f"whole numbers of 0 to {sensor.num_rows - 1}"
-        raise ValueError(f"{where}: laser number: got {laser[bad[0]]:g} in row {bad[0]}, expected {expected}")
-    return laser

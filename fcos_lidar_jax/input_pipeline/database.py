@@ -202,8 +202,7 @@ def prepare_database(
     entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
     classes = list(frames.classes)
     manifest = Manifest(_FORMAT, _VERSION, source, classes, min_points, num_sweeps, columns, entries)
-    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
-    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
+    atomic_write(folder / _MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
     return open_database(folder, fingerprint=source)
 
 
@@ -291,7 +290,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     table["boxes"] = num_boxes
     points = np.concatenate([np.zeros((0, job.columns), "<f4"), *parts])
     points_file, table_file = _files(job.folder, job.name)
-    atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # errors of tofile lack their errno
+    atomic_write(points_file, points.tobytes())  # errors of tofile lack their errno
     atomic_write(table_file, lambda path: np.savez(path, allow_pickle=False, **table))
     return len(job.indices)
 

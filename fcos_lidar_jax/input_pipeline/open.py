@@ -239,9 +239,8 @@ def open_frames(
     Traceback (most recent call last):
     ValueError: ...: no known data set, expected one of ...
     """
-    for path in (root, index, splits):
-        if path is not None:
-            local_path(path)
+    for path in filter(None, (root, index, splits)):
+        local_path(path)
     data = find_data_set(root, format, version)
     given: dict[str, Any] = {
         "index": index,

@@ -67,8 +67,8 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
         atomic_write(folder / f"{name}.npy", lambda path, column=column: np.save(path, column))
         columns[name] = _summary(column)
     about = {"format": _FORMAT, "format_version": _FORMAT_VERSION, "tables": states}
-    text = msgspec.json.format(msgspec.json.encode({**about, "columns": columns}), indent=1)
-    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
+    text = msgspec.json.encode({**about, "columns": columns})
+    atomic_write(folder / _MANIFEST, msgspec.json.format(text, indent=1))
 
 
 def default_index(root: str | Path, version: str) -> Path:
