@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.frame import (
 )
 from fcos_lidar_jax.data.splits import SPLITS, distinct_names, own_splits
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
-from fcos_lidar_jax.fields import check_name
+from fcos_lidar_jax.fields import check, check_name
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.progress import tell
@@ -122,9 +122,8 @@ class FolderFrames(FrameSet):
             files = [sweep.file for sweep in read_list(listed)]
             for i, file in enumerate(files):
                 _expect_file(listed.parent / file, self._inside, f"{listed}: $[{i}].file")
-            if (listed.parent / files[0]).resolve() != cloud.resolve():
-                expected = f"the frame's own cloud, '../clouds/{cloud.name}'"
-                raise ValueError(f"{listed}: $[0].file: got {files[0]!r}, expected {expected}")
+            is_own = (listed.parent / files[0]).resolve() == cloud.resolve()
+            check(is_own, f"{listed}: $[0].file", files[0], f"the frame's own cloud, '../clouds/{cloud.name}'")
 
     def fingerprint(self) -> str:
         self.check_files(range(len(self)))
