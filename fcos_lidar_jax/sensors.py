@@ -281,9 +281,7 @@ def load_sensor(path: str | Path) -> Sensor:
     """
     if str(path) in PRESETS:
         return PRESETS[str(path)]
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: no such sensor file, and no preset ({', '.join(PRESETS)})")
-    record = read_json(Path(path))
+    record = read_json(Path(path), what=f"a sensor file or a preset ({', '.join(PRESETS)})")
     if not isinstance(record, str):
         return sensor_from_json(record, str(path))
     check_name(str(path), record, PRESETS)

@@ -164,7 +164,7 @@ def test_errors_are_one_line_with_file_and_field(tmp_path, record, message):
 
 
 def test_missing_and_corrupt_files_are_rejected(tmp_path):
-    with pytest.raises(ValueError, match=r"no such sensor file, and no preset \(nuscenes_hdl32e"):
+    with pytest.raises(ValueError, match=r"no such file, expected a sensor file or a preset \(nuscenes_hdl32e"):
         load_sensor(tmp_path / "none.json")
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(ValueError, match=r"a\.json: not JSON"):

@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, sav
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import SampleAnnotation, Scene, read_table
 from fcos_lidar_jax.fields import Count
-from fcos_lidar_jax.files import folder_lock
+from fcos_lidar_jax.files import folder_lock, refusing
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import NUSCENES
@@ -54,10 +54,9 @@ def run(args: Prepare) -> None:
     if not data.on_disk:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
     folder = args.data.index or data.index
-    try:
+    more = "; name one by --index, here and for train"
+    with refusing("--index", PermissionError, kind=PermissionError, more=more):
         check_out_folder(folder, "--index")
-    except PermissionError as error:
-        raise PermissionError(f"--index: {error}; name one by --index, here and for train") from None
     if belongs_to_own_data(folder / "objects"):
         raise ValueError(f"--index: {folder}: a folder of own data, expected another one")
     jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use

@@ -213,7 +213,7 @@ BAD = mistakes(r"""
 --copy-paste.min-points 3 => copy_paste.min_points: got 3, expected at least the database's 5
 --optimizer.accumulate 3 => --optimizer.accumulate: got 3, expected a divisor of the batch size 2$
 --model.stem.channels-per-type 0 => --model.stem.channels-per-type: got 0, expected at least 1$
---sensor sonar => sonar: no such sensor
+--sensor sonar => sonar: no such file, expected a sensor
 --num-sweeps 2 => num_sweeps: got 2, expected at most the 1 of .*/train: run fcos-lidar prepare --num-sweeps 2$
 --train-split val => objects/val: no objects here, .* prepare --train-split val
 """)
