@@ -26,11 +26,8 @@ def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
     """
     if environment.get("JAX_LOCAL_DEVICE_IDS"):
         return None
-    where, more = (
-        "variables of Slurm or Open MPI: cannot be read",
-        ": set JAX_LOCAL_DEVICE_IDS to this process's GPUs",
-    )
-    with refusing(where, LookupError, ValueError, more=more):
+    where = "variables of Slurm or Open MPI: cannot be read"
+    with refusing(where, LookupError, ValueError, more=": set JAX_LOCAL_DEVICE_IDS to the GPUs of this process"):
         local = _local_rank(environment)
     if local is None:
         return None
