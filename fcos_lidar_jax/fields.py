@@ -66,10 +66,11 @@ def check_per_class(field: str, values: Collection[object], classes: Collection[
     check(len(values) in (0, len(classes)), field, values, expected)
 
 
-def unknown_name(name: str, known: Iterable[str]) -> str:
-    """Part of a message: the unknown name, and the nearest known names or else all of them."""
-    known = list(known)
-    return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"
+def check_name(where: str, name: str, known: Iterable[str]) -> None:
+    """Raise a ValueError with ``where`` and the nearest known names, or else all of them, for an unknown name."""
+    if name not in (known := list(known)):
+        expected = " or ".join(difflib.get_close_matches(name, known)) or ", ".join(known)
+        raise ValueError(f"{where}: got {name!r}, expected {expected}")
 
 
 class Checked:

@@ -1,8 +1,9 @@
-"""Atomic writes, locks between processes, checked JSON and checksums of files."""
+"""Atomic writes, locks between processes, checked JSON, checksums of files, and packages of extras."""
 
 import contextlib
 import fcntl
 import hashlib
+import importlib
 import json
 import os
 import re
@@ -15,24 +16,30 @@ from typing import Any
 
 import msgspec
 
+_MAX_TEXT = 1000  # of an exception, in characters
 
-def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
+
+def atomic_write(path: str | Path, content: str | bytes | Callable[[Path], object]) -> None:
     """Write to a temporary file beside ``path`` and rename it, so that no reader sees a partial file.
 
     A failure or an interruption leaves the old file unchanged and removes the temporary file. Missing parent
-    folders are created. ``write`` gets the temporary path, which has the extension of ``path``.
+    folders are created. ``content`` is text, bytes, or a function that writes to the temporary path, which has the
+    extension of ``path``.
 
     Raises:
-        OSError: ``path`` is a folder, a link or a device, or the file system or ``write`` raised it.
+        OSError: ``path`` is a folder, a link or a device, or the file system or ``content`` raised it.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "new" / "a.txt"
-    >>> atomic_write(file, lambda temporary: temporary.write_text("whole"))
+    >>> atomic_write(file, "whole")
     >>> file.read_text(), [f.name for f in file.parent.iterdir()]
     ('whole', ['a.txt'])
     """
     with atomic_path(path) as temporary:
-        write(temporary)
+        if isinstance(content, str | bytes):
+            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        else:
+            content(temporary)
 
 
 @contextlib.contextmanager
@@ -86,6 +93,19 @@ class FileState(msgspec.Struct, frozen=True):
 
 
 @contextlib.contextmanager
+def refusing(
+    where: str, *kinds: type[Exception], kind: type[Exception] = ValueError, more: str = ""
+) -> Iterator[None]:
+    """Raise exceptions of ``kinds``, by default all, again: as one line of ``kind`` that begins with ``where``."""
+    caught = kinds or (Exception,)
+    try:
+        yield
+    except caught as error:
+        text = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())[:_MAX_TEXT]
+        raise kind(f"{where}{': ' if where else ''}{text}{more}") from None
+
+
+@contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Add the file's name to write errors that lack it, such as a full disk."""
     try:
@@ -105,6 +125,31 @@ def local_path(path: str | Path) -> Path:
     return Path(path)
 
 
+def expect_file(path: Path, what: str) -> None:
+    """Refuse a path at which there is no file; ``what`` describes the expected one."""
+    if not os.path.isfile(path):
+        found = "found a folder" if os.path.isdir(path) else "no such file"
+        raise ValueError(f"{path}: {found}, expected {what}")
+
+
+def some_files(folder: Path, ending: str, what: str) -> list[Path]:
+    """The files in a folder whose names have an ending, sorted; refuses a folder without any, where ``what`` is
+    expected.
+    """
+    if not (files := sorted(folder.glob(f"*{ending}"))):
+        raise ValueError(f"{folder}: no {ending} file in it, expected {what}")
+    return files
+
+
+def import_extra(name: str, extra: str, before: str = "") -> Any:
+    """Import a package that an extra of this one installs; ``before`` begins the message if it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        how = f"pip install -e '.[{extra}]' in the repository"
+        raise ValueError(f"{before}{name} is not installed: {how}") from None
+
+
 def check_writable(path: Path) -> None:
     """Reject a path at which :func:`atomic_write` would fail, as far as this is known without writing."""
     _check_kind(path)
@@ -118,14 +163,9 @@ def check_writable(path: Path) -> None:
 def _check_kind(path: Path) -> None:
     """Reject URLs, and what a file must not replace: folders, devices, and links, whose targets would remain."""
     local_path(path)
-    found = None
-    if path.is_symlink():
-        found = f"a link to {path.readlink()}"
-    elif path.is_dir():
-        found = "a folder"
-    elif path.exists() and not path.is_file():
-        found = "a device or a pipe"
-    if found:
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        found = "a folder" if path.is_dir() else "a device or a pipe"
+        found = f"a link to {path.readlink()}" if path.is_symlink() else found
         raise FileExistsError(f"{path}: found {found}, expected a file to write")
 
 
@@ -196,14 +236,9 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     Traceback (most recent call last):
     ValueError: ...a.json: $[1]: got 3, expected str
     """
-    if not local_path(path).is_file():
-        raise ValueError(f"{path}: no such file, expected {what}")
-    try:
+    expect_file(local_path(path), what)
+    with refusing(f"{path}: cannot be read", OSError), refusing(f"{path}: not JSON", ValueError, RecursionError):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not JSON: {error}") from None
     try:
         return msgspec.convert(content, kind)
     except (msgspec.ValidationError, OverflowError, UnicodeError) as error:  # huge integers, lone surrogates

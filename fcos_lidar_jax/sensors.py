@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from fcos_lidar_jax.fields import Bounds, Checked, check, from_json, unknown_name
+from fcos_lidar_jax.fields import Bounds, Checked, check, check_name, from_json
 from fcos_lidar_jax.files import read_json
 
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
@@ -281,11 +281,8 @@ def load_sensor(path: str | Path) -> Sensor:
     """
     if str(path) in PRESETS:
         return PRESETS[str(path)]
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: no such sensor file, and no preset ({', '.join(PRESETS)})")
-    record = read_json(Path(path))
+    record = read_json(Path(path), what=f"a sensor file or a preset ({', '.join(PRESETS)})")
     if not isinstance(record, str):
         return sensor_from_json(record, str(path))
-    if record not in PRESETS:
-        raise ValueError(f"{path}: {unknown_name(record, PRESETS)}")
+    check_name(str(path), record, PRESETS)
     return PRESETS[record]

@@ -147,7 +147,7 @@ BAD = [
     ({**GOOD, "limit_z_m": [3, 1]}, "limit_z_m"),
     ({**GOOD, "forward_rad": 90}, "forward_rad: got 90.0, expected within"),
     ({**GOOD, "row_source": "ring"}, "row_source: got 'ring'"),
-    (None, r"no such sensor file, and no preset \(nuscenes_hdl32e"),
+    (None, r"no such file, expected a sensor file or a preset \(nuscenes_hdl32e"),
     ("{", "not JSON"),
     pytest.param("[" * 100_000, "not JSON", id="deep"),
     ('"tinny"', "got 'tinny', expected tiny$"),

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from experiments.changes import change
 from experiments.real_frames import read_keyframe
@@ -28,7 +29,7 @@ from fcos_lidar_jax.assignment import owners
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
-from fcos_lidar_jax.evaluation.matching import candidate_pairs, match_frame
+from fcos_lidar_jax.evaluation.matching import candidate_pairs, greedy, heading_error
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
 from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.input_pipeline.database import cut_reading
@@ -86,6 +87,48 @@ def owned_cells(frame: Frame) -> np.ndarray:
     first = np.asarray(image.features[..., 0]).reshape(-1, 9)
     owner = owners(first[:, :3], first[:, 7] > 0, frame.boxes, np.ones(len(frame.boxes), bool))
     return np.bincount(np.asarray(owner)[np.asarray(owner) >= 0], minlength=len(frame.boxes))
+
+
+@dataclasses.dataclass(frozen=True)
+class Match:
+    """One-to-one hits of one frame."""
+
+    truth: Int[np.ndarray, "p"]  # index of the truth of each hit, by decreasing score
+    detection: Int[np.ndarray, "p"]  # index of the detection of each hit
+    centre_error_m: Float[np.ndarray, "p"]  # distance of the centres in the ground plane
+
+
+def match_frame(
+    boxes: Float[np.ndarray, "d 9"],
+    labels: Int[np.ndarray, "d"],
+    scores: Float[np.ndarray, "d"],
+    true_boxes: Float[np.ndarray, "m 9"],
+    true_labels: Int[np.ndarray, "m"],
+    *,
+    max_distance_m: float,
+    max_heading_error_rad: float = np.inf,
+    heading_period_rad: Float[np.ndarray, "k"] | None = None,
+) -> Match:
+    """Match detections, by decreasing score, to the nearest free truth of their class, one to one.
+
+    Args:
+        boxes, true_boxes: ``x, y, z, l, w, h, yaw, vx, vy``.
+        scores: equal scores keep their order.
+        max_distance_m: exclusive upper limit of the distance of a hit in the ground plane.
+        max_heading_error_rad: inclusive upper limit of the yaw error of a hit.
+        heading_period_rad: period per class, see :func:`heading_error`; by default 2 pi for all classes.
+    """
+    order = np.argsort(-scores, kind="stable")
+    boxes, labels = boxes[order].astype(np.float64), labels[order]
+    true_boxes = true_boxes.astype(np.float64)
+    pairs = candidate_pairs(labels, boxes[:, :2], true_labels, true_boxes[:, :2], max_distance_m=max_distance_m)
+    own_labels = labels[pairs.detection]
+    period = np.full(len(own_labels), 2 * np.pi) if heading_period_rad is None else heading_period_rad[own_labels]
+    turn = heading_error(boxes[pairs.detection, 6], true_boxes[pairs.truth, 6], period)
+    partner = greedy(pairs.take(turn <= max_heading_error_rad), len(boxes), len(true_boxes))
+    hits = np.flatnonzero(partner >= 0)
+    truth = partner[hits]
+    return Match(truth, order[hits], np.sqrt(((boxes[hits, :2] - true_boxes[truth, :2]) ** 2).sum(axis=1)))
 
 
 def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:

@@ -22,7 +22,7 @@ import fcos_lidar_jax.presets  # noqa: F401  (a checkpoint may hold the configur
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints.preemption import after_the_block
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
-from fcos_lidar_jax.files import checksum, local_path, naming, read_json
+from fcos_lidar_jax.files import checksum, local_path, naming, read_json, refusing
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
 from fcos_lidar_jax.types import TrainState
@@ -224,13 +224,11 @@ def _check_space(folder: Path, tree: Any) -> None:
 
 
 def _save_arrays(folder: Path, tree: Any) -> None:
-    try:
+    with refusing(f"{folder}: cannot be written", kind=OSError):  # on a full disk, Orbax raises any exceptions
         with after_the_block(), _checkpointer() as checkpointer:
             checkpointer.save(folder, tree)
         # It contains a path of this machine, and is not needed: the hashes show that the checkpoint is complete.
         (folder / "commit_success.txt").unlink(missing_ok=True)
-    except Exception as error:  # on a full disk, Orbax raises arbitrary exceptions
-        raise OSError(f"{folder}: cannot be written: {_one_line(error)}") from error
 
 
 def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
@@ -244,11 +242,7 @@ def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
     except CheckpointError:
         raise
     except Exception as error:  # Orbax raises arbitrary exceptions for corrupt files
-        raise CheckpointError(f"{folder}: cannot be read: {_one_line(error)}") from error
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+        raise CheckpointError(f"{folder}: cannot be read: {' '.join(str(error).split())[:200]}") from error
 
 
 def _canonical(description: dict[str, Any]) -> bytes:
@@ -283,10 +277,8 @@ def read_description(folder: Path) -> dict[str, Any]:
         places = "a checkpoint folder, the folder of a run that has saved one, or the name of shipped weights"
         names = ", ".join(shipped_checkpoints())
         raise CheckpointError(f"{folder}: found {_found(folder)}, expected {places}: {names}")
-    try:
+    with refusing("", ValueError, kind=CheckpointError):
         description = read_json(file, dict[str, Any])
-    except ValueError as error:
-        raise CheckpointError(str(error)) from None
     if (version := description.get("format")) != _FORMAT:
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
     kinds = {"step": int, "config": dict, "sensor": dict, "files": dict}

@@ -70,8 +70,7 @@ def run(args: Benchmark) -> None:
     }
     print(as_text(record), flush=True)
     if args.out is not None:
-        text = json.dumps(record, indent=1) + "\n"
-        atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))
+        atomic_write(args.out, json.dumps(record, indent=1) + "\n")
 
 
 def measure(

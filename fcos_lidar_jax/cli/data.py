@@ -13,7 +13,7 @@ from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import read_json, refusing
 from fcos_lidar_jax.input_pipeline.open import (
     CLASS_MAPS,
     DataSet,
@@ -84,10 +84,8 @@ class DataOptions:
         frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:
             frames = SelectedFrames(frames, tuple(parse_ranges(samples, len(frames), option)))
-        try:
+        with refusing("", ValueError, more=f"; {self.data_set.reader.named_maps}"):
             mapped = MappedFrames(frames, config.classes)
-        except ValueError as error:
-            raise ValueError(f"{error}; {self.data_set.reader.named_maps}") from None
         if missing := [name for name in frames.classes if name not in config.classes]:
             if self.data_set.on_disk:  # To count the boxes of simulated frames, all would have to be simulated.
                 missing = [f"{count} {name}" for name, count in mapped.left_out().items()]

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +24,7 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
-from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, score_kitti, write_summary
+from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, score_kitti
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.fields import Natural
 from fcos_lidar_jax.files import atomic_write, folder_lock
@@ -140,7 +141,7 @@ def _score_kitti_results(args: Evaluate) -> None:
     assert isinstance(frames, KittiFrames)
     metrics = score_kitti(args.results, frames, of=f"split {split!r}" if split else str(frames.root))
     with folder_lock(args.out, "evaluating"):
-        write_summary(args.out, metrics)
+        atomic_write(args.out / KITTI_SUMMARY, json.dumps(metrics, indent=2))
     print(describe_kitti(metrics))
     print(f"look at {args.out / KITTI_SUMMARY}")
 

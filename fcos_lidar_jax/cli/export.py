@@ -38,24 +38,17 @@ class Export:
 
 def run(args: Export) -> None:
     """Export the detector, write the file, and print a record of it."""
-    checkpoint = find_checkpoint(args.checkpoint)
-    (_export_onnx if args.format == "onnx" else _export_program)(args, checkpoint)
-
-
-def _export_onnx(args: Export, checkpoint: Path) -> None:
-    detector = load_trained(checkpoint)
-    content = (network_graph if args.network_only else program_graph)(detector)
-    atomic_write(args.out, lambda path: path.write_bytes(content))
-    print(json.dumps({"file": str(args.out), "bytes": len(content), "name": detector.config.name}))
-
-
-def _export_program(args: Export, checkpoint: Path) -> None:
-    began = time.perf_counter()
-    content = export_detector(load_trained(checkpoint), num_points=args.points, batch=args.batch)
+    detector, began = load_trained(find_checkpoint(args.checkpoint)), time.perf_counter()
+    if args.format == "onnx":
+        content = (network_graph if args.network_only else program_graph)(detector)
+    else:
+        content = export_detector(detector, num_points=args.points, batch=args.batch)
     written = time.perf_counter()
-    atomic_write(args.out, lambda path: path.write_bytes(content))
-    read = time.perf_counter()
-    record = load_exported(args.out).record
-    described = {name: record[name] for name in ("name", "num_points", "batch", "weights")}
-    took = {"export_s": round(written - began, 2), "load_s": round(time.perf_counter() - read, 3)}
-    print(json.dumps({"file": str(args.out), "bytes": len(content), **described, "platforms": PLATFORMS, **took}))
+    atomic_write(args.out, content)
+    record = {"file": str(args.out), "bytes": len(content), "name": detector.config.name}
+    if args.format == "jax":
+        read = time.perf_counter()
+        loaded = load_exported(args.out).record
+        record |= {name: loaded[name] for name in ("num_points", "batch", "weights")} | {"platforms": PLATFORMS}
+        record |= {"export_s": round(written - began, 2), "load_s": round(time.perf_counter() - read, 3)}
+    print(json.dumps(record))

@@ -1,5 +1,6 @@
 """``fcos-lidar prepare``: the ground-truth database for copy-paste, and the index of nuScenes' tables."""
 
+import collections
 import dataclasses
 import json
 import re
@@ -20,7 +21,7 @@ from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, sav
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import SampleAnnotation, Scene, read_table
 from fcos_lidar_jax.fields import Count
-from fcos_lidar_jax.files import folder_lock
+from fcos_lidar_jax.files import folder_lock, refusing
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import NUSCENES
@@ -53,10 +54,9 @@ def run(args: Prepare) -> None:
     if not data.on_disk:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
     folder = args.data.index or data.index
-    try:
+    more = "; name one by --index, here and for train"
+    with refusing("--index", PermissionError, kind=PermissionError, more=more):
         check_out_folder(folder, "--index")
-    except PermissionError as error:
-        raise PermissionError(f"--index: {error}; name one by --index, here and for train") from None
     if belongs_to_own_data(folder / "objects"):
         raise ValueError(f"--index: {folder}: a folder of own data, expected another one")
     jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
@@ -108,14 +108,7 @@ def _make_index(tables: Path, folder: Path) -> Index:
     for left_over in folder.glob(".*"):
         if re.fullmatch(r"\.[0-9a-f]{12}\.(npy|json)", left_over.name):  # of a killed process
             left_over.unlink()
-    began = last = time.monotonic()
-
-    def report(file: str, rows: int) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now > last + 5:
-            last = now
-            tell(f"{file}: {rows} rows, {now - began:.0f} s")
-
-    save_index(build_index(tables, report), folder, tables=tables)
+    progress = collections.defaultdict[str, Progress](lambda: Progress("rows", None, every_s=5.0))
+    index = build_index(tables, lambda file, rows: progress[file].show(rows, file))
+    save_index(index, folder, tables=tables)
     return open_index(folder, tables=tables)

@@ -11,6 +11,7 @@ from fcos_lidar_jax.cli.checks import Needs
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.devices.launcher import local_device_ids
 from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.files import refusing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +48,8 @@ def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.
     cluster = options.coordinator or "the cluster of the environment"
     place, ids = dataclasses.astuple(options)[1:], local_device_ids(environment)
     try:
-        jax.distributed.initialize(*place, local_device_ids=ids)
+        with refusing(f"{cluster}: the processes did not connect", RuntimeError, kind=OSError):
+            jax.distributed.initialize(*place, local_device_ids=ids)
     except ValueError as error:
         if options.coordinator is not None or "defined" not in str(error):
             raise ValueError(f"{cluster}: this process cannot join: {error}") from None
@@ -55,5 +57,3 @@ def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.
             f"--distributed: found no launcher ({error}), expected Slurm, Open MPI or a TPU pod; otherwise give "
             "--coordinator, --num-processes and --process-index"
         ) from None
-    except RuntimeError as error:
-        raise OSError(f"{cluster}: the processes did not connect: {error}") from None

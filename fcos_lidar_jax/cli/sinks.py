@@ -18,7 +18,8 @@ from fcos_lidar_jax.evaluation.kitti_results import kitti_types, write_result
 from fcos_lidar_jax.evaluation.openlabel import write_openlabel
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, read_boxes
 from fcos_lidar_jax.evaluation.results import result_entries, write_results
-from fcos_lidar_jax.files import line_writer
+from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.files import expect_file, line_writer
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
@@ -38,8 +39,7 @@ _TYPES = kitti_types(TO_NUSCENES) | kitti_types()
 def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Sequence[Path] = ()) -> None:
     """Reject what the format has no place for, before anything is detected."""
     for name in args.labels or ():
-        if name not in classes:
-            raise ValueError(f"--labels: got {name!r}, expected some of {', '.join(classes)}")
+        check(name in classes, "--labels", name, f"some of {', '.join(classes)}")
     option = f"--output-format {args.output_format}"
     if args.output_format == "nuscenes":
         if others := [name for name in classes if name not in NUSCENES_CLASSES]:
@@ -235,6 +235,5 @@ def _calibration(given: Path | None, cloud: Path, stem: str) -> Path:
     if given is not None and not given.is_dir():
         return given
     file = (given or cloud.absolute().parent.parent / "calib") / f"{stem}.txt"
-    if not file.is_file():
-        raise ValueError(f"--output-format kitti: {file}: no such file, expected --calibration FILE or DIR")
+    expect_file(file, "--calibration FILE or DIR for --output-format kitti")
     return file

@@ -19,6 +19,7 @@ from fcos_lidar_jax.config import Config, RefinementConfig
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
@@ -191,10 +192,8 @@ def _refinement(args: Train) -> RefinementConfig | None:
 def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
     # --sensor was given if it differs from the preset's sensor; --name may have renamed the preset.
     presets = [preset for preset in PRESETS.values() if preset.name == config.name] or PRESETS.values()
-    if data.reader.sensor is None and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
-        raise ValueError(
-            f"--sensor: got {config.sensor!r}, expected none: {data.root}/sensor.json has {frames.sensor.name!r}"
-        )
+    fits = data.reader.sensor is not None or config.sensor in (frames.sensor.name, *(p.sensor for p in presets))
+    check(fits, "--sensor", config.sensor, f"none: {data.root}/sensor.json has {frames.sensor.name!r}")
 
 
 def _open_tests(args: Train, config: Config, root: Path) -> FrameSet | None:

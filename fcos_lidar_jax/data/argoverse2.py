@@ -17,6 +17,7 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_poi
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, check_poses, fuse_sweeps
+from fcos_lidar_jax.files import some_files
 from fcos_lidar_jax.geometry import pose_matrix, wrap_angle
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
 
@@ -162,12 +163,10 @@ def _logs(folder: Path) -> list[Path]:
 def _stamps(log: Path) -> list[int]:
     """Times of a log's sweeps in nanoseconds, from the file names."""
     stamps = []
-    for file in (log / _SWEEPS).glob("*.feather"):
+    for file in some_files(log / _SWEEPS, ".feather", "sweeps, TIMESTAMP.feather"):
         if not (file.stem.isascii() and file.stem.isdecimal()) or str(int(file.stem)) != file.stem:
             raise ValueError(f"{file}: got {file.stem!r}, expected a name of whole nanoseconds")
         stamps.append(int(file.stem))
-    if not stamps:
-        raise ValueError(f"{log / _SWEEPS}: no sweep in it, expected TIMESTAMP.feather files")
     return sorted(stamps)
 
 

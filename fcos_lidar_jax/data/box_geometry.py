@@ -61,16 +61,6 @@ def footprints_overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return ~apart
 
 
-def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Which points lie in an upright box, boundary included, bool[n]; in float64.
-
-    Args:
-        points: [n, >= 3], metres.
-        box: ``x, y, z, l, w, h, yaw, ...``.
-    """
-    return np.asarray(points_in_box(points[:, :3].astype(np.float64), np.asarray(box, np.float64)))
-
-
 def count_inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Points inside each upright box, boundary included, i32[m]."""
     return np.array([len(rows) for rows in points_in_boxes(points, boxes)], np.int32)
@@ -79,8 +69,7 @@ def count_inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 def points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
     """Rows of the points inside each upright box, boundary included: one ascending i64 array per box.
 
-    Looks up all points in a coarse grid of the ground and tests only the points near a box exactly, by
-    :func:`inside_box`.
+    Looks up all points in a coarse grid of the ground and tests only the points near a box exactly, in float64.
 
     Args:
         points: [n, >= 3], metres; non-finite points are in no box.
@@ -93,21 +82,21 @@ def points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
     boxes = np.asarray(boxes, np.float64)
     if not len(points) or not len(boxes):
         return [np.zeros(0, np.int64) for _ in boxes]
-    reach = _reach(boxes)
+    cos, sin = np.abs(np.cos(boxes[:, 6])), np.abs(np.sin(boxes[:, 6]))
+    l, w = boxes[:, 3], boxes[:, 4]
+    # Half the sides of the axis-aligned rectangle around each footprint, f64[m, 2].
+    reach = np.stack([l * cos + w * sin, l * sin + w * cos], axis=1) / 2 + _SLACK_M
     near = _near_boxes(points, boxes[:, :2], reach)
     near = near[np.argsort(points[near, 0], kind="stable")]
     x = points[near, 0].astype(np.float64)
     first = np.searchsorted(x, boxes[:, 0] - reach[:, 0], side="left")
     last = np.searchsorted(x, boxes[:, 0] + reach[:, 0], side="right")
-    candidates = (near[i:j] for i, j in zip(first, last, strict=True))
-    return [np.sort(rows[inside_box(points[rows], box)]) for box, rows in zip(boxes, candidates, strict=True)]
-
-
-def _reach(boxes: np.ndarray) -> np.ndarray:
-    """Half the sides of the axis-aligned rectangle around each footprint, f64[m, 2]."""
-    cos, sin = np.abs(np.cos(boxes[:, 6])), np.abs(np.sin(boxes[:, 6]))
-    l, w = boxes[:, 3], boxes[:, 4]
-    return np.stack([l * cos + w * sin, l * sin + w * cos], axis=1) / 2 + _SLACK_M
+    found = []
+    for box, i, j in zip(boxes, first, last, strict=True):
+        rows = near[i:j]
+        inside = points_in_box(points[rows, :3].astype(np.float64), box)
+        found.append(np.sort(rows[np.asarray(inside)]))
+    return found
 
 
 def _near_boxes(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> np.ndarray:

@@ -126,24 +126,19 @@ def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarr
     """
     num_truncated = 0
     if len(kept) > len(points):
-        cloud = np.concatenate(parts)[kept]
-        rows = _newest(cloud[:, 4], len(points))
-        num_truncated = len(cloud) - len(rows)
-        parts, kept = [cloud[rows]], np.ones(len(rows), bool)
+        cloud, number = np.concatenate(parts)[kept], len(points)
+        newest = np.ones(len(cloud), bool)
+        if len(cloud) > number:  # the newest sweeps, and random rows of the sweep at the boundary
+            lags = cloud[:, 4]
+            boundary = np.partition(lags, number)[number]
+            newest = lags < boundary
+            shuffled = np.random.default_rng(_SEED).permutation(np.flatnonzero(lags == boundary))
+            newest[shuffled[: number - np.count_nonzero(newest)]] = True
+        parts, kept = [cloud[newest]], np.ones(np.count_nonzero(newest), bool)
+        num_truncated = len(cloud) - len(kept)
     np.concatenate(parts, out=points[: len(kept)])
     valid[: len(kept)] = kept
     return num_truncated
-
-
-def _newest(lags: np.ndarray, number: int) -> np.ndarray:
-    """Rows of the newest sweeps, ascending; random rows of the sweep at the boundary."""
-    if len(lags) <= number:
-        return np.arange(len(lags))
-    boundary = np.partition(lags, number)[number]
-    kept = lags < boundary
-    shuffled = np.random.default_rng(_SEED).permutation(np.flatnonzero(lags == boundary))
-    kept[shuffled[: number - np.count_nonzero(kept)]] = True
-    return np.flatnonzero(kept)
 
 
 def no_usable_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> str | None:

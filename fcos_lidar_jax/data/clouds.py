@@ -47,9 +47,6 @@ class CloudFiles(FrameSet):
         """A frame without boxes; reads nothing."""
         return unlabelled(no_points(self.sensor))
 
-    def labels(self, index: int) -> np.ndarray:
-        return np.zeros(0, np.int32)
-
     def name(self, index: int) -> str:
         return str(self.files[index])
 

@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.frame import (
 )
 from fcos_lidar_jax.data.splits import SPLITS, distinct_names, own_splits
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
-from fcos_lidar_jax.fields import unknown_name
+from fcos_lidar_jax.fields import check, check_name
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.progress import tell
@@ -122,9 +122,8 @@ class FolderFrames(FrameSet):
             files = [sweep.file for sweep in read_list(listed)]
             for i, file in enumerate(files):
                 _expect_file(listed.parent / file, self._inside, f"{listed}: $[{i}].file")
-            if (listed.parent / files[0]).resolve() != cloud.resolve():
-                expected = f"the frame's own cloud, '../clouds/{cloud.name}'"
-                raise ValueError(f"{listed}: $[0].file: got {files[0]!r}, expected {expected}")
+            is_own = (listed.parent / files[0]).resolve() == cloud.resolve()
+            check(is_own, f"{listed}: $[0].file", files[0], f"the frame's own cloud, '../clouds/{cloud.name}'")
 
     def fingerprint(self) -> str:
         self.check_files(range(len(self)))
@@ -161,9 +160,8 @@ class FolderFrames(FrameSet):
         kept, labels = [], []
         for i, record in enumerate(records):
             label = self._translation.get(record.label, record.label)
-            if label is not None and label not in self.classes:
-                raise ValueError(f"{file}: $.boxes[{i}].label: {unknown_name(label, self.classes)}")
             if label is not None:
+                check_name(f"{file}: $.boxes[{i}].label", label, self.classes)
                 kept.append(i)
                 labels.append(self.classes.index(label))
         boxes = boxes[kept]
@@ -175,7 +173,7 @@ class FolderFrames(FrameSet):
         file = self.root / _CLASSES
         classes: list[str] | dict[str, str | None] = {}
         if os.path.lexists(file):
-            _expect_inside(file, self._inside, str(file))
+            point_files.check_inside(file, self._inside, str(file))
             classes = read_json(file, list[str] | dict[str, str | None])
         if isinstance(classes, list):
             if not classes or len(set(classes)) < len(classes):
@@ -228,24 +226,18 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
     """Refuse a missing file, and one that a link or ``..`` leads out of the folder ``inside``."""
     if not os.path.isfile(file):
         raise ValueError(f"{where}: no such file" + ("" if where == str(file) else f": {file}"))
-    _expect_inside(file, inside, where)
-
-
-def _expect_inside(file: Path, inside: Path | None, where: str) -> None:
-    if inside is not None:
-        point_files.check_inside(file, inside, where)
+    point_files.check_inside(file, inside, where)
 
 
 def read_sensor(root: Path, inside: Path | None = None) -> Sensor:
     """Read ``sensor.json`` of a folder, which no link may lead out of the folder ``inside``."""
     file = root / _SENSOR
-    _expect_inside(file, inside, str(file))
+    point_files.check_inside(file, inside, str(file))
     return load_sensor(file)
 
 
 def _read_split(root: Path, file: str | Path | None, split: str, clouds: Collection[str]) -> tuple[str, ...]:
     file = Path(file or root / SPLITS)
     splits, where = own_splits(root, file), f"{file}: {split}"
-    if split not in splits:
-        raise ValueError(f"{file}: split: {unknown_name(split, splits)}")
+    check_name(f"{file}: split", split, splits)
     return distinct_names(((f"{where}[{i}]", name) for i, name in enumerate(splits[split])), clouds, where)

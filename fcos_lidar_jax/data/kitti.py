@@ -11,7 +11,8 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
-from fcos_lidar_jax.fields import check, unknown_name
+from fcos_lidar_jax.fields import check, check_name
+from fcos_lidar_jax.files import expect_file, some_files
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
@@ -208,8 +209,7 @@ def camera_calibration(file: Path) -> Path | None:
     calibration = file.absolute().parent.parent / "calib" / f"{file.stem}.txt"
     if usual_sensor(file) != KITTI_HDL64E or not calibration.parent.is_dir():
         return None
-    if not calibration.is_file():
-        raise ValueError(f"{calibration}: found nothing, expected the calibration of {file} (or --full-turn)")
+    expect_file(calibration, f"the calibration of {file} (or --full-turn)")
     return calibration
 
 
@@ -235,8 +235,8 @@ def read_objects(file: Path, *, scored: bool = False) -> tuple[list[str], np.nda
         if len(words) not in lengths:
             raise ValueError(f"{where}: got {len(words)} values, expected {expected}")
         kind = _TYPES.get(words[0].lower(), words[0])
-        if kind not in _TYPES.values() and not scored:
-            raise ValueError(f"{where}: type: {unknown_name(kind, CLASSES)}")
+        if not scored and kind != "DontCare":
+            check_name(f"{where}: type", kind, CLASSES)
         named = zip(_FIELDS, words[1:], strict=False)
         rows.append([read_number(word, f"{where}: {name}") for name, word in named])
         rows[-1] += [np.nan] * (16 - len(words))
@@ -265,15 +265,10 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
 
 
 def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
-    splits = _stems(root / "ImageSets", ".txt")
-    if split not in splits:
-        raise ValueError(f"{root / 'ImageSets'}: split: {unknown_name(split, sorted(splits))}")
+    check_name(f"{root / 'ImageSets'}: split", split, sorted(_stems(root / "ImageSets", ".txt")))
     file = root / "ImageSets" / f"{split}.txt"
     return distinct_names(((where, " ".join(words)) for where, words in read_lines(file)), clouds, str(file))
 
 
 def _stems(folder: Path, ending: str) -> set[str]:
-    stems = {file.stem for file in folder.glob(f"*{ending}")}
-    if not stems:
-        raise ValueError(f"{folder}: no {ending} file in it, expected at least one")
-    return stems
+    return {file.stem for file in some_files(folder, ending, "at least one")}

@@ -10,6 +10,7 @@ from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import FARTHEST_M, Sweep
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
+from fcos_lidar_jax.files import refusing, some_files
 from fcos_lidar_jax.sensors import Sensor
 
 _EARTH_RADIUS_M = 6_378_137.0
@@ -31,9 +32,7 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
     first latitude, as in the data set's development kit.
     """
     points = folder / "velodyne_points"
-    files = sorted(points.joinpath("data").glob("*.bin"))
-    if not files:
-        raise ValueError(f"{points / 'data'}: no .bin file in it, expected sweeps")
+    files = some_files(points / "data", ".bin", "sweeps")
     times = dict(read_lines(points / "timestamps.txt", "the times of the sweeps"))
     own, of_day = folder / _CALIBRATION, folder.absolute().parent / _CALIBRATION
     matrices = read_matrices(own if own.is_file() else of_day, {"R": (3, 3), "T": (3, 1)}, ("R",))
@@ -78,9 +77,8 @@ def _time_us(times: dict[str, list[str]], timestamps: Path, sweep: Path) -> int:
     line = int(sweep.stem) + 1 if sweep.stem.isdecimal() and len(sweep.stem) < 19 else 0
     where = f"{timestamps}: line {line}"
     text = " ".join(times.get(where, []))
-    try:
+    with refusing(
+        f"{where}: time of {sweep.name}", ValueError, more=", expected 2011-09-26 13:02:25.59 or the like"
+    ):
         since = datetime.fromisoformat(text).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
-    except ValueError:
-        expected = "expected such as 2011-09-26 13:02:25.594360375"
-        raise ValueError(f"{where}: time of {sweep.name}: got {text[:40]!r}, {expected}") from None
     return since // timedelta(microseconds=1)

@@ -1,12 +1,13 @@
 """Safe parsing of ``.npy`` and ``.npz`` files: sizes are Python integers and checked before any allocation."""
 
-import contextlib
 import io
 import math
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
+
+from fcos_lidar_jax.files import refusing
 
 _HEADER_BYTES = 2**15  # more than NumPy reads of a header
 MAX_BYTES = 2**31  # default limit of an unpacked array
@@ -29,12 +30,10 @@ def parse_npy(content: bytes, *, max_rows: int | None = None) -> np.ndarray:
 def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     """Shape, Fortran order, type and offset of the values, from the first bytes of a file."""
     stream = io.BytesIO(content)
-    try:
+    with refusing(""):  # damaged headers raise arbitrary exceptions, even the tokenizer's
         first = np.lib.format.read_magic(stream) == (1, 0)  # later versions differ only in names of fields
         read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read_header(stream)
-    except Exception as error:  # damaged headers raise arbitrary exceptions, even the tokenizer's
-        raise ValueError(" ".join(str(error).split())) from None
     if dtype.hasobject:
         raise ValueError("got pickled objects, expected an array without pickled objects")
     if max_rows is not None and shape and shape[0] > max_rows:
@@ -42,18 +41,18 @@ def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...],
     return shape, fortran, dtype, stream.tell()
 
 
-def npz_names(content: bytes) -> list[str]:
-    """Names of the arrays in an ``.npz`` file; ValueError if it is damaged."""
-    with _opened(content) as archive:
-        return [_name(member) for member in archive.infolist()]
-
-
 def parse_npz(
     content: bytes, names: Sequence[str], *, max_rows: int | None = None, max_bytes: int = MAX_BYTES
 ) -> dict[str, np.ndarray]:
-    """Some arrays of an ``.npz`` file, each as in :func:`parse_npy` and with at most ``max_bytes`` unpacked."""
-    with _opened(content) as archive:
-        members, arrays = {_name(member): member for member in archive.infolist()}, {}
+    """Some arrays of an ``.npz`` file, each as in :func:`parse_npy` and with at most ``max_bytes`` unpacked.
+
+    If a single name is given and the file has a single array, the array may have another name.
+    """
+    # Damaged archives raise arbitrary exceptions.
+    with refusing(""), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members, arrays = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}, {}
+        if len(names) == len(members) == 1:
+            members = dict(zip(names, members.values(), strict=True))
         for name in names:
             if name not in members:
                 raise ValueError(f"got arrays {', '.join(members) or 'none'}, expected {name}")
@@ -70,16 +69,3 @@ def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, max_rows: int | N
         _read_header(head, max_rows)  # before the rest is unpacked
         # Limited, since an archive may unpack to more than it says.
         return head + stream.read(max(member.file_size + 1 - len(head), 0))
-
-
-def _name(member: zipfile.ZipInfo) -> str:
-    return member.filename.removesuffix(".npy")
-
-
-@contextlib.contextmanager
-def _opened(content: bytes) -> Iterator[zipfile.ZipFile]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            yield archive
-    except Exception as error:  # damaged archives raise arbitrary exceptions
-        raise ValueError(" ".join(str(error).split())) from None

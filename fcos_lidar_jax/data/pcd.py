@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fcos_lidar_jax.files import refusing
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.progress import tell
 
@@ -44,7 +45,7 @@ def parse_pcd(
     {'x': [5.0], 'y': [0.0], 'z': [-1.5], 'laser': [31.0]}
     """
     header, body = _read_header(content)
-    try:
+    with refusing("damaged header", KeyError, TypeError, ValueError):
         fields, number = _read_fields(header), _num_points(header)
         places = find_columns([field.name for field in fields], where)
         single = all(fields[place].count == 1 for place in places.values())
@@ -53,8 +54,6 @@ def parse_pcd(
             raise ValueError(f"COUNT and POINTS: got {found}, expected one value per column and point")
         read = _FORMS[" ".join(header["DATA"]).lower()]
         pose = _read_viewpoint(header, where, needed=viewpoint)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"damaged header: {error}") from None
     if number > max_points or number * _size(fields) > max_bytes:
         size = f"{number} points of {_size(fields)} bytes"
         raise ValueError(f"POINTS: got {size}, expected at most {max_points} and {max_bytes} bytes in all")

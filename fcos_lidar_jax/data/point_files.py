@@ -4,15 +4,14 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fcos_lidar_jax.data.npy_files import npz_names, parse_npy, parse_npz
+from fcos_lidar_jax.data.npy_files import parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.files import local_path
+from fcos_lidar_jax.files import expect_file, import_extra, local_path, refusing
 from fcos_lidar_jax.sensors import Sensor
 
 ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # supported names, the longest first
@@ -89,18 +88,14 @@ def read_points(
         table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)
         return assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
     content, max_bytes = _read_whole(path, max_points), max_points * BYTES_PER_POINT
-    try:
+    with refusing(f"{path}: not a readable {kind} file", ValueError):
         if kind == ".pcd":
             limits = {"max_points": max_points, "max_bytes": max_bytes}
             parsed = parse_pcd(content, str(path), **limits, viewpoint=viewpoint)
         elif kind == ".npy":
             parsed = parse_npy(content, max_rows=max_points)
         else:
-            names = npz_names(content)
-            name = names[0] if len(names) == 1 else "points"
-            parsed = parse_npz(content, [name], max_rows=max_points, max_bytes=max_bytes)[name]
-    except ValueError as error:
-        raise ValueError(f"{path}: not a readable {kind} file: {error}") from None
+            parsed = parse_npz(content, ["points"], max_rows=max_points, max_bytes=max_bytes)["points"]
     if isinstance(parsed, dict):
         return assemble_points(path, sensor, parsed, num_sweeps)
     return points_from_array(parsed, sensor, str(path), num_sweeps)
@@ -170,42 +165,31 @@ def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_PO
     ``kinds`` maps columns to NumPy's letters of the allowed types: ``"fiu"`` numbers, ``"iu"`` whole numbers,
     ``"O"`` texts. Rows without a value are refused.
     """
-    try:
-        import pyarrow
-    except ImportError:
-        how = "pip install -e '.[argoverse2]' in the repository"
-        raise ValueError(f"{path}: pyarrow is not installed, which reads .feather: {how}") from None
+    pyarrow = import_extra("pyarrow", "argoverse2", f"{path}: ")
     content = _read_whole(path, max_rows)
-    try:
-        return _read_columns(pyarrow, content, kinds, max_rows)
-    except Exception as error:  # corrupt files raise arbitrary exceptions
-        raise ValueError(f"{path}: not a readable .feather file: {' '.join(str(error).split())}") from None
-
-
-def _read_columns(pyarrow: Any, content: bytes, kinds: Mapping[str, str], max_rows: int) -> dict[str, np.ndarray]:
-    reader, batches, num_rows, columns = pyarrow.ipc.open_file(content), [], 0, {}
-    for i in range(reader.num_record_batches):
-        batches.append(reader.get_batch(i))
-        num_rows += batches[-1].num_rows
-        if num_rows > max_rows:
-            raise ValueError(f"got more than {max_rows} rows, expected at most {max_rows}")
-    table = pyarrow.Table.from_batches(batches, reader.schema)
-    for name, kind in kinds.items():
-        column = table.column(name)
-        column.validate(full=True)  # crafted files may contain wrong offsets and lengths
-        columns[name] = values = column.to_numpy()
-        fits = values.dtype.kind in kind and (kind != "O" or all(isinstance(text, str) for text in values))
-        if column.null_count or not fits:
-            got = f"{column.null_count} rows without a value" if column.null_count else column.type
-            expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
-            raise ValueError(f"{name}: got {got}, expected {expected}")
+    with refusing(f"{path}: not a readable .feather file"):  # corrupt files raise arbitrary exceptions
+        reader, batches, num_rows, columns = pyarrow.ipc.open_file(content), [], 0, {}
+        for i in range(reader.num_record_batches):
+            batches.append(reader.get_batch(i))
+            num_rows += batches[-1].num_rows
+            if num_rows > max_rows:
+                raise ValueError(f"got more than {max_rows} rows, expected at most {max_rows}")
+        table = pyarrow.Table.from_batches(batches, reader.schema)
+        for name, kind in kinds.items():
+            column = table.column(name)
+            column.validate(full=True)  # crafted files may contain wrong offsets and lengths
+            columns[name] = values = column.to_numpy()
+            fits = values.dtype.kind in kind and (kind != "O" or all(isinstance(text, str) for text in values))
+            if column.null_count or not fits:
+                got = f"{column.null_count} rows without a value" if column.null_count else column.type
+                expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
+                raise ValueError(f"{name}: got {got}, expected {expected}")
     return columns
 
 
-def check_inside(file: Path, folder: Path, where: str) -> None:
-    """Refuse a file that a link or ``..`` leads out of a folder; ``where`` names it in the message."""
-    real = os.path.realpath(file)
-    if not Path(real).is_relative_to(os.path.realpath(folder)):
+def check_inside(file: Path, folder: Path | None, where: str) -> None:
+    """Refuse a file that a link or ``..`` leads out of a folder, if any; ``where`` names it in the message."""
+    if folder and not Path(real := os.path.realpath(file)).is_relative_to(os.path.realpath(folder)):
         found = f"resolves to {real}, expected a file inside {folder}"
         raise ValueError(f"{where}: {found}; --follow-links allows links that lead out")
 
@@ -213,13 +197,11 @@ def check_inside(file: Path, folder: Path, where: str) -> None:
 def _read_whole(path: Path, max_points: int) -> bytes:
     """The bytes of a file, which may be at most as large as a cloud."""
     limit = max_points * BYTES_PER_POINT + _HEADER_BYTES
-    try:
+    with refusing(f"{path}: cannot be read", OSError):
         size = path.stat().st_size
         if size > limit:
             raise ValueError(f"{path}: got {size} bytes, expected at most {limit} for {max_points} points")
         content = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     if not content:
         raise ValueError(f"{path}: empty file, expected points")
     return content
@@ -227,9 +209,7 @@ def _read_whole(path: Path, max_points: int) -> bytes:
 
 def _kind(path: Path, *, raw: bool) -> str:
     """The file's extension among :data:`ENDINGS`; with ``raw`` any other name counts as ``.bin``."""
-    if not os.path.isfile(path):
-        found = "found a folder" if os.path.isdir(path) else "no such file"
-        raise ValueError(f"{path}: {found}, expected a point file")
+    expect_file(path, "a point file")
     for ending in ENDINGS:
         if path.name.lower().endswith(ending):
             return ending
@@ -297,17 +277,13 @@ def assemble_points(
         lag = f"{points[negative[0], 4]:g} in row {negative[0]}"
         raise ValueError(f"{where}: time_lag: got {lag}, expected seconds of at least 0")
     if sensor.row_source == "laser":
-        points[:, 5] = _laser_numbers(where, sensor, table)
+        if "laser" not in table:
+            expected = f"one for every point, since sensor {sensor.name} needs it"
+            raise ValueError(f"{where}: no laser number in it, expected {expected}")
+        laser = table["laser"].astype(np.float64)
+        bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
+        if len(bad):
+            expected = f"whole numbers of 0 to {sensor.num_rows - 1}"
+            raise ValueError(f"{where}: laser number: got {laser[bad[0]]:g} in row {bad[0]}, expected {expected}")
+        points[:, 5] = laser
     return points
-
-
-def _laser_numbers(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
-    if "laser" not in table:
-        expected = f"one for every point, since sensor {sensor.name} needs it"
-        raise ValueError(f"{where}: no laser number in it, expected {expected}")
-    laser = table["laser"].astype(np.float64)
-    bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
-    if len(bad):
-        expected = f"whole numbers of 0 to {sensor.num_rows - 1}"
-        raise ValueError(f"{where}: laser number: got {laser[bad[0]]:g} in row {bad[0]}, expected {expected}")
-    return laser

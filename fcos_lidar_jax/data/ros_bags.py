@@ -22,6 +22,7 @@ from fcos_lidar_jax.data.frame_tree import FrameTree, printable
 from fcos_lidar_jax.data.pcd import find_columns
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, assemble_points
 from fcos_lidar_jax.data.sweeps import Sweep
+from fcos_lidar_jax.files import import_extra
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor
 
@@ -114,11 +115,9 @@ class _Bag(contextlib.AbstractContextManager):
     """An open recording; exceptions about damaged content become one-line errors."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            from rosbags import rosbag1, rosbag2
-        except ImportError:
-            how = "pip install -e '.[ros]' in the repository"
-            raise ValueError(f"{path}: rosbags is not installed, which reads recordings: {how}") from None
+        import_extra("rosbags", "ros", f"{path}: ")
+        from rosbags import rosbag1, rosbag2
+
         files = [path, *path.iterdir()] if path.is_dir() else [path]
         if odd := [file for file in files if file.suffix == ".db3" and set("%?#") & set(str(file))]:
             raise ValueError(f"{printable(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")

@@ -13,7 +13,7 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import read_json, refusing
 from fcos_lidar_jax.sensors import Sensor
 
 _GAP_US = (1_000, 10_000_000)  # plausible mean time between sweeps; others are not microseconds
@@ -88,10 +88,8 @@ def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any
     """
 
     def read(index: int, each: ListedSweep) -> Sweep:
-        try:
+        with refusing(f"{path}: $[{index}].file", ValueError):
             points = read_points(path.parent / each.file, sensor, num_sweeps=1, **layout)
-        except ValueError as error:
-            raise ValueError(f"{path}: $[{index}].file: {error}") from None
         return Sweep(points, np.array(each.sensor_to_world), each.timestamp_us)
 
     sweeps = (read(index, each) for index, each in enumerate(read_list(path)[: reading.num_sweeps]))

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.data.sweeps import is_rotation
+from fcos_lidar_jax.files import expect_file, refusing
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -15,12 +16,9 @@ def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
 
     ``what`` describes the expected file, if there is none or it is not text.
     """
-    if not file.is_file():
-        raise ValueError(f"{file}: no such file, expected {what}")
-    try:
+    expect_file(file, what)
+    with refusing(f"{file}: expected {what}", UnicodeDecodeError):
         lines = file.read_text(encoding="utf-8-sig").splitlines()  # Windows editors write a byte order mark
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{file}: got {error.reason} at byte {error.start}, expected {what}") from None
     rows = ((f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1))
     return [(where, words) for where, words in rows if words]
 

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+from fcos_lidar_jax.files import refusing
+
 _SLURM = ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_NTASKS", "SLURM_PROCID", "SLURM_LOCALID")
 """Variables of processes started by srun, as in JAX; inside a job, other processes lack some of them."""
 _TASKS = ("SLURM_STEP_TASKS_PER_NODE", "SLURM_NTASKS_PER_NODE", "SLURM_TASKS_PER_NODE")
@@ -24,11 +26,9 @@ def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
     """
     if environment.get("JAX_LOCAL_DEVICE_IDS"):
         return None
-    try:
+    where = "variables of Slurm or Open MPI: cannot be read"
+    with refusing(where, LookupError, ValueError, more=": set JAX_LOCAL_DEVICE_IDS to the GPUs of this process"):
         local = _local_rank(environment)
-    except (LookupError, ValueError) as error:
-        problem = f"cannot be read: {error}: set JAX_LOCAL_DEVICE_IDS to the GPUs of this process"
-        raise ValueError(f"variables of Slurm or Open MPI: {problem}") from None
     if local is None:
         return None
     rank, size = local

@@ -15,7 +15,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation.boxes import heading_yaw
-from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.files import atomic_write, expect_file
 
 _NOT_FINITE = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|(NaN|-?Infinity)')
 """Also matches strings, so that their contents are not replaced."""
@@ -45,8 +45,7 @@ def read_source(source: str | Path | dict[str, Any], kind: Any, *, given: str = 
         text = json.dumps(source, default=lambda array: array.tolist()).encode()
         return decode_json(text, kind, given), given
     path = Path(source)
-    if not path.is_file():
-        raise ValueError(f"{path}: {'found a folder' if path.is_dir() else 'no such file'}, expected a JSON file")
+    expect_file(path, "a JSON file")
     if path.stat().st_size == 0:
         raise ValueError(f"{path}: empty file, expected JSON")
     with path.open("rb") as stream:

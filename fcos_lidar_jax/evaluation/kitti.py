@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.kitti import CLASSES, read_objects
+from fcos_lidar_jax.files import some_files
 
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
 """Class that KITTI evaluates -> overlap that a detection must exceed, from above, in 3D and in the image."""
@@ -69,9 +70,7 @@ def evaluate_kitti(
     >>> evaluate_kitti(folder, folder)["classes"]["Car"]["3d"]  # 35 pixels high
     {'easy': None, 'moderate': 100.0, 'hard': 100.0}
     """
-    files = sorted(results_folder(results_dir).glob("*.txt"))
-    if not files:
-        raise ValueError(f"{results_dir}: no .txt file in it, expected one for every frame")
+    files = some_files(results_folder(results_dir), ".txt", "one for every frame")
     truth, found = _Objects([Path(label_dir) / file.name for file in files]), _Objects(files, scored=True)
     named = np.isin(found.types, CLASSES)
     flat, low = np.isnan(found.reach)[named], (found.height < _LOWEST)[named]

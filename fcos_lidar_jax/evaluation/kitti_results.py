@@ -57,7 +57,7 @@ def write_kitti(out: Path, detections: Iterable[Detections], frames: FrameSet | 
     metrics = evaluate_kitti(folder, source.root / "training" / "label_2", classes=classes)
     others = [name for name, kind in zip(frames.classes, kinds, strict=True) if kind not in MIN_OVERLAP]
     metrics["left_out"] = others + [name for name in MIN_OVERLAP if name not in classes]
-    write_summary(out, metrics)
+    atomic_write(out / KITTI_SUMMARY, json.dumps(metrics, indent=2))
     return metrics
 
 
@@ -66,12 +66,6 @@ def score_kitti(results: Path, frames: KittiFrames, *, of: str) -> dict[str, Any
     names = [frames.name(index) for index in range(len(frames))]
     expect_samples(sorted(file.stem for file in results_folder(results).glob("*.txt")), names, str(results), of=of)
     return evaluate_kitti(results, frames.root / "training" / "label_2")
-
-
-def write_summary(out: Path, metrics: dict[str, Any]) -> None:
-    """Write KITTI's metric as ``metrics_kitti.json``."""
-    text = json.dumps(metrics, indent=2)
-    atomic_write(out / KITTI_SUMMARY, lambda file: file.write_text(text, encoding="utf-8"))
 
 
 def _kitti_frames(frames: FrameSet | None) -> tuple[KittiFrames, dict[str, str]] | None:
@@ -135,7 +129,7 @@ def write_result(
         pixels = " ".join(f"{v:.2f}" for v in image[i])
         place = " ".join(f"{v:.6g}" for v in camera[i])
         lines.append(f"{types[i]} -1 -1 {alpha[i]:.4f} {pixels} {place} {scores[i]:.9g}\n")
-    atomic_write(path, lambda file: file.write_text("".join(lines), encoding="utf-8"))
+    atomic_write(path, "".join(lines))
     return len(boxes) - len(lines)
 
 

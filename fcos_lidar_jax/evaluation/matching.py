@@ -62,15 +62,6 @@ def greedy(pairs: Pairs, num_detections: int, num_truths: int) -> Int[np.ndarray
     return np.array(partner, np.int64)
 
 
-@dataclasses.dataclass(frozen=True)
-class Match:
-    """One-to-one hits of one frame."""
-
-    truth: Int[np.ndarray, "p"]  # index of the truth of each hit, by decreasing score
-    detection: Int[np.ndarray, "p"]  # index of the detection of each hit
-    centre_error_m: Float[np.ndarray, "p"]  # distance of the centres in the ground plane
-
-
 def heading_error(
     predicted_rad: Float[np.ndarray, "n"], true_rad: Float[np.ndarray, "n"], period_rad: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
@@ -82,39 +73,6 @@ def heading_error(
     turn = np.where(period_rad > 0, period_rad, 1.0)
     difference = np.abs((true_rad - predicted_rad + turn / 2) % turn - turn / 2)
     return np.where(period_rad > 0, difference, 0.0)
-
-
-def match_frame(
-    boxes: Float[np.ndarray, "d 9"],
-    labels: Int[np.ndarray, "d"],
-    scores: Float[np.ndarray, "d"],
-    true_boxes: Float[np.ndarray, "m 9"],
-    true_labels: Int[np.ndarray, "m"],
-    *,
-    max_distance_m: float,
-    max_heading_error_rad: float = np.inf,
-    heading_period_rad: Float[np.ndarray, "k"] | None = None,
-) -> Match:
-    """Match detections, by decreasing score, to the nearest free truth of their class, one to one.
-
-    Args:
-        boxes, true_boxes: ``x, y, z, l, w, h, yaw, vx, vy``.
-        scores: equal scores keep their order.
-        max_distance_m: exclusive upper limit of the distance of a hit in the ground plane.
-        max_heading_error_rad: inclusive upper limit of the yaw error of a hit.
-        heading_period_rad: period per class, see :func:`heading_error`; by default 2 pi for all classes.
-    """
-    order = np.argsort(-scores, kind="stable")
-    boxes, labels = boxes[order].astype(np.float64), labels[order]
-    true_boxes = true_boxes.astype(np.float64)
-    pairs = candidate_pairs(labels, boxes[:, :2], true_labels, true_boxes[:, :2], max_distance_m=max_distance_m)
-    own_labels = labels[pairs.detection]
-    period = np.full(len(own_labels), 2 * np.pi) if heading_period_rad is None else heading_period_rad[own_labels]
-    turn = heading_error(boxes[pairs.detection, 6], true_boxes[pairs.truth, 6], period)
-    partner = greedy(pairs.take(turn <= max_heading_error_rad), len(boxes), len(true_boxes))
-    hits = np.flatnonzero(partner >= 0)
-    truth = partner[hits]
-    return Match(truth, order[hits], _length(boxes[hits, :2] - true_boxes[truth, :2]))
 
 
 def _length(vectors: np.ndarray) -> np.ndarray:

@@ -80,17 +80,13 @@ def write_evaluation(
     :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`; ``report`` is called with the number of finished sets.
     For ``meta`` see :func:`full_summary`.
     """
-
-    def write(name: str, value: Any) -> None:
-        atomic_write(out / name, lambda file: file.write_text(json.dumps(value, indent=2), encoding="utf-8"))
-
-    write("metrics_summary.json", full_summary(evaluation, meta))
-    write("curves.json", _curves(evaluation))
+    atomic_write(out / "metrics_summary.json", json.dumps(full_summary(evaluation, meta), indent=2))
+    atomic_write(out / "curves.json", json.dumps(_curves(evaluation), indent=2))
     if not repeats:
         (out / "bootstrap.json").unlink(missing_ok=True)
         return None
     intervals = bootstrap(evaluation, repeats=repeats, report=report)
-    write("bootstrap.json", intervals)
+    atomic_write(out / "bootstrap.json", json.dumps(intervals, indent=2))
     return intervals
 
 

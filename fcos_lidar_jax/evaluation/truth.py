@@ -21,6 +21,7 @@ from fcos_lidar_jax.evaluation.boxes import (
     join,
     make_columns,
 )
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.geometry import rotation_matrix
 
 _RACK = -1  # temporary label of bicycle racks
@@ -44,11 +45,9 @@ def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
     raw, name = json_io.read_source(source, msgspec.Raw, given="ground truth")
     ego, parts, rotations = dict[str, json_io.Vector](), [NO_BOXES], [np.zeros((0, 4))]
     for row, (token, sample) in enumerate(json_io.decode_samples(raw, Sample, name)):
-        if not max(map(abs, sample.ego_translation)) <= FARTHEST_M:
-            got, expected = list(sample.ego_translation), f"numbers of at most {FARTHEST_M:g}"
-            raise ValueError(f"{name}: sample {token}: ego_translation: got {got}, expected {expected}")
-        ego[token] = sample.ego_translation
-        boxes, where = sample.boxes, f"{name}: sample {token}"
+        boxes, where, near = sample.boxes, f"{name}: sample {token}", f"numbers of at most {FARTHEST_M:g}"
+        ego[token] = there = sample.ego_translation
+        check(max(map(abs, there)) <= FARTHEST_M, f"{where}: ego_translation", list(there), near)
         label = json_io.index_of(boxes, "detection_name", {**LABELS, BICYCLE_RACK: _RACK}, where)
         attribute = json_io.index_of(boxes, "attribute_name", ATTRIBUTE_INDEX, where)
         points = np.array([box.num_pts for box in boxes], np.int64)
@@ -80,8 +79,7 @@ def split_truth(data: NuScenes, tokens: Sequence[str]) -> GroundTruth:
     rows, sample = rows[kept], sample[kept]
     attributes = [*map(str, index.attribute_name), ""]  # the last entry is for index -1
     for name in (attributes[i] for i in np.unique(index.box_attribute[rows])):
-        if name not in ATTRIBUTE_INDEX:
-            raise ValueError(f"{data.tables / 'attribute.json'}: name: got {name!r}, expected a known attribute")
+        check(name in ATTRIBUTE_INDEX, f"{data.tables / 'attribute.json'}: name", name, "a known attribute")
     boxes = make_columns(
         sample=sample,
         label=np.array([label_of(name) for name in names])[index.box_category[rows]],  # -1 for a rack

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, TrueBoxes
-from fcos_lidar_jax.fields import unknown_name
+from fcos_lidar_jax.fields import check_name
 
 _TABLE_ROWS = 20
 
@@ -74,8 +74,8 @@ class DetectedBoxes:
         """Select boxes by score and class, by default of all classes; a ValueError names an unknown class."""
         kept = self.scores >= min_score
         labels = {labels} if isinstance(labels, str) else {*labels}
-        for name in labels - {*self.classes}:
-            raise ValueError(f"labels: {unknown_name(name, self.classes)}")
+        for name in labels:
+            check_name("labels", name, self.classes)
         if labels:
             kept &= np.isin(self.names, list(labels))
         return self._rows(kept)

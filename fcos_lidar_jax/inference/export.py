@@ -24,7 +24,7 @@ from fcos_lidar_jax.checkpoints.storage import CheckpointError, with_later_field
 from fcos_lidar_jax.config import config_from_json, config_to_json
 from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.files import checksum, refusing
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, jit_split
 from fcos_lidar_jax.models import build_detector
@@ -175,34 +175,26 @@ def load_exported(file: Path) -> ExportedDetector:
     record, program = _read(file)
     config = config_from_json(with_later_fields(record["config"]), f"{file}: config")
     sensor = sensor_from_json(record["sensor"], f"{file}: sensor")
-    try:
+    where = f"{file}: not readable by jax {jax.__version__}: found the program of {record['written_by']}"
+    with refusing(where, kind=CheckpointError):
         exported = export.deserialize(bytearray(program))
-    except Exception as error:  # a version that this JAX cannot read
-        raise CheckpointError(
-            f"{file}: not readable by jax {jax.__version__}: found the program of {record['written_by']}: "
-            f"{' '.join(str(error).split())[:200]}"
-        ) from error
     return ExportedDetector(build_detector(config, sensor), record, exported)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], bytes]:
-    try:
-        with file.open("rb") as stream:
-            first = stream.readline(_MAX_FIRST_LINE)
-            if not first.startswith(_MAGIC.encode() + b" "):
-                raise CheckpointError(f"{file}: found a file, {_EXPECTED}")
-            content = stream.read(min(file.stat().st_size, _MAX_BYTES))  # read() allocates its whole argument
-    except OSError as error:
-        raise CheckpointError(f"{file}: cannot be read: {error.strerror}") from None
+    with refusing(f"{file}: cannot be read", OSError, kind=CheckpointError), file.open("rb") as stream:
+        first = stream.readline(_MAX_FIRST_LINE)
+        if not first.startswith(_MAGIC.encode() + b" "):
+            raise CheckpointError(f"{file}: found a file, {_EXPECTED}")
+        content = stream.read(min(file.stat().st_size, _MAX_BYTES))  # read() allocates its whole argument
     version, _, expected = first.decode("ascii", "replace").removeprefix(_MAGIC).strip().partition(" ")
     if version != str(_FORMAT):
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
     if (actual := checksum(content)) != expected:
         raise CheckpointError(f"{file}: checksum {actual!r}, expected {expected!r}: damaged")
     line, _, program = content.partition(b"\n")
-    try:
+    where = f"{file}: found a forged record, {_EXPECTED}"
+    with refusing(where, ValueError, RecursionError, kind=CheckpointError):  # includes msgspec's errors
         record = json.loads(line[:_MAX_RECORD])
         msgspec.convert(record, _Record)
-    except (ValueError, RecursionError):  # includes msgspec's errors
-        raise CheckpointError(f"{file}: found a forged record, {_EXPECTED}") from None
     return record, program

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint, load_checkpoint
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
 from fcos_lidar_jax.inference.export import load_exported
 from fcos_lidar_jax.inference.openvino import with_openvino
@@ -27,8 +28,7 @@ def load_detector(checkpoint: str | Path, *, backend: Backend = "xla") -> CloudD
     >>> load_detector("quickstart").classes[:2]
     ('car', 'truck')
     """
-    if backend not in get_args(Backend):
-        raise ValueError(f"backend: got {backend!r}, expected one of {', '.join(get_args(Backend))}")
+    check(backend in get_args(Backend), "backend", backend, f"one of {', '.join(get_args(Backend))}")
     path = find_checkpoint(Path(checkpoint))
     if backend == "openvino":
         if path.is_file():

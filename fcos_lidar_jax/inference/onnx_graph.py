@@ -4,7 +4,6 @@ Like ``Detector.apply``, it maps the features of a range image to the raw predic
 projection, decoding and NMS. Images inside the graph are [b, c, h, w].
 """
 
-import importlib
 import json
 import sys
 import types
@@ -17,6 +16,7 @@ import numpy as np
 
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.config import Config, ModelConfig, StemConfig, config_to_json
+from fcos_lidar_jax.files import import_extra
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout
 from fcos_lidar_jax.models.layers import EPSILON, norm_groups
@@ -41,9 +41,7 @@ def cpu_package(name: str) -> Any:
     reporter = sys.modules.get(_TELEMETRY)
     sys.modules[_TELEMETRY] = None  # type: ignore[assignment]
     try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ValueError(f"{name} is not installed: pip install -e '.[cpu]' in the repository") from None
+        return import_extra(name, "cpu")
     finally:
         if reporter is None:
             del sys.modules[_TELEMETRY]

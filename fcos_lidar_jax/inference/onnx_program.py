@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fcos_lidar_jax.data.cloud_policy import usable_rows
+from fcos_lidar_jax.files import refusing
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.inference.onnx_graph import Graph, add_network, cpu_package
@@ -61,8 +62,6 @@ def program_graph(detector: TrainedDetector) -> bytes:
 def _add(graph: Graph, stage: str, function: Callable[..., Any], shapes: Sequence[Any], values: Any) -> Any:
     """Add a stage to a graph; returns its results, as names in the graph and as shapes."""
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
-    try:
+    with refusing(f"ONNX: {stage}", NotImplementedError):
         results = translate(graph, jaxpr, jax.tree.leaves(values))
-    except NotImplementedError as error:
-        raise ValueError(f"ONNX: {stage}: {error}") from None
     return jax.tree.unflatten(jax.tree.structure(shape), results), shape

@@ -117,15 +117,11 @@ class _Finished:
         return ((name, self.log.entry(key)) for name, key in zip(self.names, self.keys, strict=True))
 
 
-def log_of(path: Path) -> Path:
-    """The resume log beside a results file, or a folder of them."""
-    path = path if path.name else path.absolute()  # such as "."
-    return path.with_name(f".{path.name}.resume_log")
-
-
 @contextlib.contextmanager
 def _open_log(path: Path, fingerprint: str) -> Iterator[ResumeLog]:
-    file = log_of(path)
+    """The resume log beside a results file, or a folder of them."""
+    named = path if path.name else path.absolute()  # such as "."
+    file = named.with_name(f".{named.name}.resume_log")
     with file_lock(file) as held:
         if not held:
             raise BlockingIOError(f"{path}: in use: another process is detecting, expected no other process")

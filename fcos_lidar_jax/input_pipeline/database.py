@@ -22,7 +22,7 @@ from fcos_lidar_jax.data.cloud_policy import unusable_cloud, unusable_clouds, us
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.files import atomic_write, checksum, read_json
+from fcos_lidar_jax.files import atomic_write, checksum, read_json, refusing
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.workers import run_jobs
 
@@ -55,14 +55,11 @@ class Shard(msgspec.Struct, forbid_unknown_fields=True):
     table_blake2b: str
 
 
-class _Header(msgspec.Struct):
-    format: str
-    version: int
-
-
-class Manifest(_Header, forbid_unknown_fields=True):
+class Manifest(msgspec.Struct, forbid_unknown_fields=True):
     """Marks a finished database: it is written last."""
 
+    format: Annotated[str, msgspec.Meta(pattern=f"^{_FORMAT}$")]
+    version: Annotated[int, msgspec.Meta(ge=_VERSION, le=_VERSION)]  # before fields that other versions may lack
     source: str
     classes: list[str]
     min_points: int
@@ -122,8 +119,9 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
     Missing, unfinished, altered and truncated databases, and databases of another version, are refused.
     """
     folder = Path(folder)
-    manifest = _read_manifest(folder)
     file = folder / _MANIFEST
+    with refusing("", ValueError, more=f"; {_REBUILD}"):
+        manifest = read_json(file, Manifest, what="a finished ground-truth database")
     expected = f"{fingerprint!r}: built from other data, {_REBUILD}"
     check(fingerprint in (None, manifest.source), f"{file}: source", manifest.source, expected)
     tables = []
@@ -146,16 +144,6 @@ def objects_folder(index: Path, split: str | None) -> Path:
     name = split or "all_frames"
     check(name not in (".", "..") and not set("/\0") & set(name), "split", name, "a name that a folder can have")
     return index / "objects" / name
-
-
-def _read_manifest(folder: Path) -> Manifest:
-    """Read a finished database's manifest; errors as in :func:`open_database`."""
-    file = folder / _MANIFEST
-    header = read_json(file, _Header, what="a finished ground-truth database")
-    if (header.format, header.version) != (_FORMAT, _VERSION):
-        found = f"got {header.format!r} version {header.version}, expected {_FORMAT!r} version {_VERSION}"
-        raise ValueError(f"{file}: {found}; {_REBUILD}")
-    return read_json(file, Manifest)
 
 
 def prepare_database(
@@ -214,8 +202,7 @@ def prepare_database(
     entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
     classes = list(frames.classes)
     manifest = Manifest(_FORMAT, _VERSION, source, classes, min_points, num_sweeps, columns, entries)
-    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
-    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
+    atomic_write(folder / _MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
     return open_database(folder, fingerprint=source)
 
 
@@ -303,7 +290,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     table["boxes"] = num_boxes
     points = np.concatenate([np.zeros((0, job.columns), "<f4"), *parts])
     points_file, table_file = _files(job.folder, job.name)
-    atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # errors of tofile lack their errno
+    atomic_write(points_file, points.tobytes())  # errors of tofile lack their errno
     atomic_write(table_file, lambda path: np.savez(path, allow_pickle=False, **table))
     return len(job.indices)
 
@@ -311,11 +298,9 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
 def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None = None) -> _Table:
     """Read and check a shard's table and the size of its points; ``expected`` is the table's checksum."""
     points_file, file = _files(folder, name)
-    try:
+    with refusing(f"{file}: not a table of objects", OSError, ValueError, more=f"; {_REBUILD}"):
         data = file.read_bytes()
         arrays = parse_npz(data, ["rows", "recipe", "unusable", "boxes"])
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{file}: not a table of objects: {error}; {_REBUILD}") from None
     digest = checksum(data)
     if expected is not None and digest != expected:
         raise ValueError(f"{file}: checksum differs from the manifest's; {_REBUILD}")

@@ -17,7 +17,7 @@ from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.data.recorded import check_scale
 from fcos_lidar_jax.data.splits import own_splits
-from fcos_lidar_jax.fields import unknown_name
+from fcos_lidar_jax.fields import check_name
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
@@ -126,8 +126,8 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
     patterns.
     """
     readers: dict[str, Reader] = {reader.name: reader for reader in READERS}
-    if format is not None and format not in readers:
-        raise ValueError(f"format: {unknown_name(format, readers)}")
+    if format is not None:
+        check_name("format", format, readers)
     reader = readers[format] if format else None
     if reader is not None and not reader.marks:
         if root is not None:
@@ -239,9 +239,8 @@ def open_frames(
     Traceback (most recent call last):
     ValueError: ...: no known data set, expected one of ...
     """
-    for path in (root, index, splits):
-        if path is not None:
-            local_path(path)
+    for path in filter(None, (root, index, splits)):
+        local_path(path)
     data = find_data_set(root, format, version)
     given: dict[str, Any] = {
         "index": index,

@@ -6,7 +6,7 @@ from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.frame import Frame, FrameSet
-from fcos_lidar_jax.fields import unknown_name
+from fcos_lidar_jax.fields import check_name
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -66,8 +66,7 @@ _FULL_REACH_M = 45.0
 
 def simulated_split(split: str, sensor: Sensor, reading: CloudReading) -> SimulatedFrames:
     """Streets that fit the sensor: plain streets for a short range, varied streets otherwise."""
-    if split not in SIMULATED_SPLITS:
-        raise ValueError(f"split: {unknown_name(split, SIMULATED_SPLITS)}")
+    check_name("split", split, SIMULATED_SPLITS)
     make = SimulatedFrames if sensor.limit_xy_m < _FULL_REACH_M else city_frames
     return dataclasses.replace(make(sensor, *SIMULATED_SPLITS[split]), reading=reading)
 

@@ -27,7 +27,7 @@ class MetricsLog:
         file = folder / METRICS
         if file.exists():
             kept = [json.dumps(line) + "\n" for line in read_metrics(folder) if line["step"] <= first_step]
-            atomic_write(file, lambda path: path.write_text("".join(kept), encoding="utf-8"))
+            atomic_write(file, "".join(kept))
         self._lines = file.open("a", encoding="utf-8")
         self._folder = folder / "tensorboard"
         self._folder.mkdir(exist_ok=True)

@@ -200,8 +200,7 @@ def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool
     with folder_lock(folder, "training"):
         check_run(folder, spec, resume=resume)  # another process may have been faster
         if spec is not None and not resume:
-            text = json.dumps(spec, indent=1)
-            atomic_write(folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
+            atomic_write(folder / RUN_SPEC, json.dumps(spec, indent=1))
         yield
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes, one_per_object
+from fcos_lidar_jax.files import refusing
 from fcos_lidar_jax.visualization.bev import corners_from_above
 from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, write_labels
 
@@ -31,11 +32,9 @@ def draw_camera(
     """
     from PIL import Image
 
-    try:
-        with Image.open(image) as opened:
-            pixels = np.asarray(opened.convert("RGB"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{image}: found {type(error).__name__}, expected a PNG or JPEG image") from None
+    unreadable = OSError, ValueError, SyntaxError, Image.DecompressionBombError
+    with refusing(f"{image}: expected a PNG or JPEG image", *unreadable), Image.open(image) as opened:
+        pixels = np.asarray(opened.convert("RGB"))
     height, width = pixels.shape[:2]
     figure = new_figure(_WIDTH_IN, _WIDTH_IN * height / width)
     figure.set_layout_engine("none")  # the image fills the figure

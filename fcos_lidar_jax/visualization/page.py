@@ -133,4 +133,4 @@ def write_page(
     # Names may contain anything, even "</script>".
     text = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
     template = files("fcos_lidar_jax.visualization").joinpath("page.html").read_text(encoding="utf-8")
-    atomic_write(path, lambda file: file.write_text(template.replace("{{drive}}", text), encoding="utf-8"))
+    atomic_write(path, template.replace("{{drive}}", text))

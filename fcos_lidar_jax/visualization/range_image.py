@@ -1,6 +1,5 @@
 """Pictures of multi-round range images."""
 
-import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -39,7 +38,9 @@ def draw_range_image(
     outlined in round 1, in the colour of its class, around the cells whose points lie in it; boxes without such a
     cell are not visible.
     """
-    view = _View.of(azimuth_limits_rad)
+    right, left = np.degrees(azimuth_limits_rad or (-np.pi, np.pi)).round(6).tolist()
+    step = 45 if left - right > 180 else 15
+    azimuths = range(math.floor(left / step) * step, math.ceil(right / step) * step - 1, -step)
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
     lags = features[:, :, _LAG].any()
@@ -55,42 +56,24 @@ def draw_range_image(
     ticks = np.unique(np.linspace(0, rows - 1, 5).round().astype(int))
     degrees = np.degrees(_row_inclinations(features))[ticks]
     for axis, (channel, r, outline) in zip(axes, panels, strict=True):
-        name = _draw_channel(figure, axis, features, channel, r, view)
+        name = _draw_channel(figure, axis, features, channel, r, (left, right))
         axis.set_ylabel("inclination", fontsize=9)
-        axis.set(xlim=(view.left, view.right), ylim=(rows, 0))
+        axis.set(xlim=(left, right), ylim=(rows, 0))
         if outline is not None:
             kind, boxes = outline
-            name += (
-                f"; {kind}: {_outline(axis, features, boxes, classes, view)} of {len(boxes[0])} boxes have a cell"
-            )
+            number = _outline(axis, features, boxes, classes, (left, right), full_turn=azimuth_limits_rad is None)
+            name += f"; {kind}: {number} of {len(boxes[0])} boxes have a cell"
         axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
-        axis.set_xticks(view.ticks, [f"{v - 360 if v > 180 else v}°" for v in view.ticks])
+        axis.set_xticks(azimuths, [f"{v - 360 if v > 180 else v}°" for v in azimuths])
         axis.set_yticks(ticks + 0.5, [f"{round(v)}°" for v in degrees])
         axis.tick_params(labelsize=9)
     axes[-1].set_xlabel(f"azimuth (0° along +x, 90° along +y), {columns} columns clockwise", fontsize=9)
     save_png(figure, path)
 
 
-@dataclasses.dataclass(frozen=True)
-class _View:
-    """Azimuth span of a picture, degrees."""
-
-    left: float
-    right: float
-    full_turn: bool
-
-    @staticmethod
-    def of(azimuth_limits_rad: tuple[float, float] | None) -> "_View":
-        right, left = np.degrees(azimuth_limits_rad or (-np.pi, np.pi)).round(6).tolist()
-        return _View(left, right, azimuth_limits_rad is None)
-
-    @property
-    def ticks(self) -> range:
-        step = 45 if self.left - self.right > 180 else 15
-        return range(math.floor(self.left / step) * step, math.ceil(self.right / step) * step - 1, -step)
-
-
-def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r: int, view: _View) -> str:
+def _draw_channel(
+    figure: Any, axis: Any, features: np.ndarray, channel: int, r: int, span: tuple[float, float]
+) -> str:
     import matplotlib as mpl
     from matplotlib.colors import LogNorm, Normalize
 
@@ -106,7 +89,7 @@ def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r:
         norm=norm,
         aspect="auto",
         interpolation="nearest",
-        extent=(view.left, view.right, filled.shape[0], 0),
+        extent=(*span, filled.shape[0], 0),
     )
     beyond = {_RANGE: "both", _INTENSITY: "max", _LAG: "neither"}[channel]
     bar = figure.colorbar(picture, ax=axis, pad=0.01, aspect=10, extend=beyond)
@@ -133,9 +116,18 @@ def _row_inclinations(features: np.ndarray) -> np.ndarray:
 
 
 def _outline(
-    axis: Any, features: np.ndarray, given: tuple[np.ndarray, ...], classes: Sequence[str], view: _View
+    axis: Any,
+    features: np.ndarray,
+    given: tuple[np.ndarray, ...],
+    classes: Sequence[str],
+    span: tuple[float, float],
+    *,
+    full_turn: bool,
 ) -> int:
-    """Draw rectangles around the first-round cells of each box; returns the number of boxes with cells."""
+    """Draw rectangles around the first-round cells of each box; returns the number of boxes with cells.
+
+    ``span`` are the azimuths of the picture's left and right side, degrees.
+    """
     from matplotlib.patches import Rectangle
     from matplotlib.patheffects import withStroke
 
@@ -144,14 +136,14 @@ def _outline(
     filled = np.flatnonzero(first_round[:, _EXISTENCE] > 0)
     boxes, labels, *scores = given
     boxes_cells = [filled[rows] for rows in points_in_boxes(first_round[filled, :3], boxes)]
-    degrees, drawn = (view.left - view.right) / columns, []
+    degrees, drawn = (span[0] - span[1]) / columns, []
     for index, cells in enumerate(boxes_cells):
         if not len(cells):
             continue
         rows_in, columns_in = np.divmod(cells, columns)
         top, bottom = rows_in.min(), rows_in.max() + 1
-        spans = _spans(columns_in, columns) if view.full_turn else [(columns_in.min(), columns_in.max())]
-        edges = [(view.left - degrees * first, view.left - degrees * (last + 1)) for first, last in spans]
+        spans = _spans(columns_in, columns) if full_turn else [(columns_in.min(), columns_in.max())]
+        edges = [(span[0] - degrees * first, span[0] - degrees * (last + 1)) for first, last in spans]
         for left, right in edges:
             style = {"edgecolor": class_color(labels[index]), "linewidth": 1.4}
             around = axis.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, **style))

@@ -71,7 +71,7 @@ def write_report(
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{_text(title)}</title><style>{_STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
     )
-    atomic_write(path, lambda out: out.write_text(page, encoding="utf-8"))
+    atomic_write(path, page)
 
 
 def _text(value: Cell) -> str:

@@ -187,7 +187,7 @@ BAD = {
     "no sensor": (
         lambda r: (r / "sensor.json").unlink(),
         "sensor.json",
-        "no such sensor file, and no preset (nusc",
+        "no such file, expected a sensor file or a preset (nusc",
     ),
     "class": (lambda r: write(r / "classes.json", ["carr"]), B, "$.boxes[0].label: got 'car', expected carr"),
     "class twice": (lambda r: write(r / "classes.json", ["car", "car"]), "classes.json", "2 names, expected at"),

@@ -310,7 +310,7 @@ def test_unusable_roots_and_indexes_are_refused(made, tmp_path):
     manifest, column = folder / "index.json", folder / "box_size.npy"
     record, content = json.loads(manifest.read_text()), bytearray(column.read_bytes())
     for message, changes in (
-        ("index.json: format: got ('fcos_lidar_index', 99), expected", {"format_version": 99}),
+        ("index.json: $.format_version: got 99, expected int <= 3: run prepare", {"format_version": 99}),
         ("index.json: $.columns: got 3, expected object: run prepare", {"columns": 3}),
     ):
         manifest.write_text(json.dumps({**record, **changes}))

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.matching import candidate_pairs, heading_error, match_frame
+from experiments.studies.overfit_keyframe import match_frame
+from fcos_lidar_jax.evaluation.matching import candidate_pairs, heading_error
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
 
 CAR, CONE, BARRIER = (NUSCENES_METRIC.classes.index(c) for c in ("car", "traffic_cone", "barrier"))

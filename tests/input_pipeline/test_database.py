@@ -218,7 +218,7 @@ MANIFEST, TABLE, POINTS = "manifest.json", "scene-b.objects.npz", "scene-c.point
 DAMAGE = {
     "no manifest": (MANIFEST, Path.unlink, "no such file, expected a finished"),
     "truncated manifest": (MANIFEST, lambda f: cut(f, 100), "not JSON"),
-    "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 5; rebuild it with"),
+    "older version": (MANIFEST, lambda f: edit(f, version=2), "version: got 2, expected int >= 5; rebuild it"),
     "path": (MANIFEST, lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]), "name: got '/etc/x', expected"),
     "few classes": (MANIFEST, lambda f: edit(f, classes=["car"]), "classes: got ['car'], expected at least "),
     "altered table": (TABLE, lambda f: flip(f, 700), "rebuild it with"),

@@ -15,10 +15,10 @@ import pytest
 import tiny_peer
 from tiny_run import SENSOR, TINY_CONFIG, TINY_REFINED, weights
 
+from experiments.studies.overfit_keyframe import match_frame
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.coding import encode
 from fcos_lidar_jax.config import OptimizerConfig
-from fcos_lidar_jax.evaluation.matching import match_frame
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout, locate, location_cells

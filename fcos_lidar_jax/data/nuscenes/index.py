@@ -3,17 +3,17 @@
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.npy_files import parse_npy
 from fcos_lidar_jax.data.nuscenes.tables import TABLES
-from fcos_lidar_jax.files import FileState, atomic_write, read_json
+from fcos_lidar_jax.files import FileState, atomic_write, read_json, refusing
 
 _FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 3
-_MANIFEST = "index.json"
+_MANIFEST, _AGAIN = "index.json", ": run prepare again"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +67,8 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
         atomic_write(folder / f"{name}.npy", lambda path, column=column: np.save(path, column))
         columns[name] = _summary(column)
     about = {"format": _FORMAT, "format_version": _FORMAT_VERSION, "tables": states}
-    text = msgspec.json.format(msgspec.json.encode({**about, "columns": columns}), indent=1)
-    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
+    text = msgspec.json.encode({**about, "columns": columns})
+    atomic_write(folder / _MANIFEST, msgspec.json.format(text, indent=1))
 
 
 def default_index(root: str | Path, version: str) -> Path:
@@ -86,41 +86,29 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
     ``ROOT/VERSION``.
     """
     folder = Path(folder)
-    manifest = _read_manifest(folder / _MANIFEST)
+    with refusing("", ValueError, more=_AGAIN):
+        manifest = read_json(folder / _MANIFEST, _Manifest, what="a finished index")
     indexed, present = manifest.tables, _tables(tables)
     for name in {**present, **indexed}:
         if name not in indexed or name not in present or not indexed[name].holds(present[name]):
-            problem = f"the index was made from another table than the one in {tables}: run prepare again"
+            problem = f"the index was made from another table than the one in {tables}{_AGAIN}"
             raise ValueError(f"{folder / _MANIFEST}: {name}: {problem}")
     columns = {}
     for field in dataclasses.fields(Index):
         file = folder / f"{field.name}.npy"
-        try:
+        with refusing(f"{file}: cannot be read", OSError, ValueError, more=_AGAIN):
             column = parse_npy(file.read_bytes())
-            summary = _summary(column)
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{file}: cannot be read ({error}): run prepare again") from None
-        if manifest.columns.get(field.name) != summary:
-            raise ValueError(f"{file}: content differs from {_MANIFEST}: run prepare again")
+        if manifest.columns.get(field.name) != _summary(column):
+            raise ValueError(f"{file}: content differs from {_MANIFEST}{_AGAIN}")
         columns[field.name] = column
     return Index(**columns)
 
 
 class _Manifest(msgspec.Struct):
-    format: str
-    format_version: int
+    format: Annotated[str, msgspec.Meta(pattern=f"^{_FORMAT}$")]
+    format_version: Annotated[int, msgspec.Meta(ge=_FORMAT_VERSION, le=_FORMAT_VERSION)]
     tables: dict[str, FileState]
     columns: dict[str, dict[str, Any]]
-
-
-def _read_manifest(file: Path) -> _Manifest:
-    try:
-        manifest = read_json(file, _Manifest, what="a finished index")
-    except ValueError as error:
-        raise ValueError(f"{error}: run prepare again") from None
-    if (found := (manifest.format, manifest.format_version)) != (_FORMAT, _FORMAT_VERSION):
-        raise ValueError(f"{file}: format: got {found}, expected {(_FORMAT, _FORMAT_VERSION)}: run prepare again")
-    return manifest
 
 
 def column_checksums(index: Index) -> list[tuple[str, str]]:

@@ -18,7 +18,7 @@ from fcos_lidar_jax.data.nuscenes.names import label_of
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.point_files import MAX_POINTS, check_inside
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
-from fcos_lidar_jax.fields import unknown_name
+from fcos_lidar_jax.fields import check_name
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix, rotation_matrix, wrap_angle
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
@@ -158,8 +158,7 @@ class NuScenes:
 
     def _keyframe_rows(self, scene: str) -> list[int]:
         names = self.index.scene_name.astype(str).tolist()
-        if scene not in names:
-            raise ValueError(f"{self.tables}: scene: {unknown_name(scene, names)}")
+        check_name(f"{self.tables}: scene", scene, names)
         rows = self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
         if not rows:
             raise ValueError(f"{self.tables / 'sample.json'}: scene {scene}: found no keyframe, expected one")
