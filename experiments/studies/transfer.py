@@ -184,6 +184,7 @@ def main(args: Args) -> None:
     out = args.out or Path("outputs/transfer.json")
     described = read_description(find_checkpoint(args.checkpoint))
     of = {"name": str(args.checkpoint), "step": described["step"], "hash": described["hash"]}
+    of |= {"second_look": args.second_look, "mirrored": args.mirrored}
     record = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
     if record.get("checkpoint") != of:
         record = {"checkpoint": of}
