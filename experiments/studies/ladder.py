@@ -10,9 +10,10 @@ nuScenes' HDL-32E (32 x 272 pixels) with one sweep and one round: 4,000 frames o
 steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on 200 unseen frames, and on 60 of them
 after each quarter of the training. A second look (``refinement``) is trained in the same step ("joint"), or
 afterwards on the same frames ("looked at again"), with the first trial's weights frozen and boxes that were found
-once: by 3,000 updates of four frames, or, after "local geometry", by 24,000 of one of 2,000 frames. The seconds
-per step of the latter are its whole time without the detector's training, divided by the steps. Only "neighbours"
-and "local geometry, looked at again" compare each box with its neighbours, as ``compact`` does.
+once: by 3,000 updates of four frames, or, "for longer" and after "local geometry", by 24,000 of one of 2,000
+frames. The seconds per step of the latter are its whole time without the detector's training, divided by the
+steps. Only "neighbours" and "local geometry, looked at again" compare each box with its neighbours, as ``compact``
+does.
 
 The same command resumes a trial, except for the updates of a second look afterwards. Trials that are already in
 the file of ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the
@@ -33,7 +34,7 @@ from experiments.changes import LARGER, LONE_LOOK, QUARTER_LOOK, SLIM, Change, c
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
-from experiments.second_look import look_again, look_config
+from experiments.second_look import USES, look_again, look_config
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
@@ -85,12 +86,14 @@ class Afterwards:
         return lambda config: look_config(TRIALS[self.first](config), self.look, batch_size=self.batch_size)
 
 
+_LONGER = 2000, USES * 2000, 1
 AFTERWARDS = {
     "larger, looked at again": Afterwards("larger", LONE_LOOK),
     "CenterPoint, looked at again": Afterwards("CenterPoint", LONE_LOOK),
     f"{_SMALL}, looked at again": Afterwards(_SMALL, QUARTER_LOOK),
     f"{_SMALL}, looked at again without them": Afterwards(_SMALL, LONE_LOOK),
-    "local geometry, looked at again": Afterwards("local geometry", QUARTER_LOOK, 2000, 24_000, 1),
+    f"{_SMALL}, looked at again for longer": Afterwards(_SMALL, QUARTER_LOOK, *_LONGER),
+    "local geometry, looked at again": Afterwards("local geometry", QUARTER_LOOK, *_LONGER),
 }
 TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
