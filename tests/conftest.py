@@ -95,3 +95,11 @@ def real_data() -> Path:
     if not folder:
         pytest.skip("FCOS_LIDAR_REAL_DATA is not set: no real LiDAR data here")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set of ``two_scenes``, for tests of several commands."""
+    from two_scenes import make_two_scenes  # imports the package, whose signatures are checked from here on
+
+    return make_two_scenes(tmp_path_factory.mktemp("home"))

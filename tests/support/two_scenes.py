@@ -1,9 +1,8 @@
-"""What tests of several commands share."""
+"""Two scenes, prepared, for tests of commands."""
 
 import json
 from pathlib import Path
 
-import pytest
 from commands import command
 from linear_network import linear_network
 from tiny_run import CONFIG, SENSOR, untrained, weights
@@ -12,13 +11,11 @@ from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.sensors import sensor_to_json
 
 
-@pytest.fixture(scope="session")
-def root(tmp_path_factory) -> Path:
+def make_two_scenes(home: Path) -> Path:
     """Two scenes of six keyframes, one to train on and one to test on, with an index and objects.
 
     Their sensor and two checkpoints are beside them.
     """
-    home = tmp_path_factory.mktemp("home")
     (home / "sensor.json").write_text(json.dumps(sensor_to_json(SENSOR)))
     command("synthesize --scenes 2 --keyframes 6 --out", home / "data", "--sensor", home / "sensor.json")
     command("prepare --num-sweeps 1 --data-root", home / "data")
