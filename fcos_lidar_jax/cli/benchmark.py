@@ -39,9 +39,9 @@ class Benchmark:
     """Time a detector on one device: each stage, the whole path from file to boxes, and batches.
 
     After a first run that compiles them, the stages are timed in turn. `detect` is a single program of all
-    stages; an exported detector has only this program. The speed of the network, in
-    operations per second, is compared with a product of two float32 matrices. Expect a small fraction of that
-    speed, because narrow channels move more data than they multiply.
+    stages; an exported detector has only this program. The speed of the network, in operations per second, is
+    compared with a product of two float32 matrices. Expect a small fraction of that speed, because narrow
+    channels move more data than they multiply.
     """
 
     files: tyro.conf.Positional[

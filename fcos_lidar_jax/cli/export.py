@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 from typing import Annotated, Literal
 
-from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import Needs, Output
 from fcos_lidar_jax.cli.options import option
@@ -38,7 +37,7 @@ class Export:
 
 def run(args: Export) -> None:
     """Export the detector, write the file, and print a record of it."""
-    detector, began = load_trained(find_checkpoint(args.checkpoint)), time.perf_counter()
+    detector, began = load_trained(args.checkpoint), time.perf_counter()
     if args.format == "onnx":
         content = (network_graph if args.network_only else program_graph)(detector)
     else:
