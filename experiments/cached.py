@@ -35,7 +35,7 @@ class CachedFrames(WrappedFrames):
         super().__post_init__()
         own, file = _description(self.frames), self.folder / "frames.json"
         if not file.is_file():
-            atomic_write(file, lambda path: path.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8"))
+            atomic_write(file, json.dumps(own, indent=1) + "\n")
         stored = read_json(file, dict[str, Any])
         for name in {**own, **stored}:
             if own.get(name) != stored.get(name):

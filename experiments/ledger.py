@@ -24,9 +24,9 @@ from experiments.paper import PAPER
 from experiments.paper_tables.cells import Cell, changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
 from experiments.paper_tables.tables import SCORES
-from experiments.script import run_script, write_text
+from experiments.script import run_script
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import atomic_write, read_json
 
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
@@ -233,7 +233,7 @@ def main(args: Args) -> None:
     ledger = as_markdown(args.results)
     print(ledger, end="", flush=True)
     if args.write:
-        write_text(README, with_ledger(README.read_text(encoding="utf-8"), ledger))
+        atomic_write(README, with_ledger(README.read_text(encoding="utf-8"), ledger))
 
 
 if __name__ == "__main__":

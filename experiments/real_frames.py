@@ -17,7 +17,7 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import read_json, refusing
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E as SENSOR
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
@@ -37,15 +37,13 @@ def read_keyframe(folder: Path, sensor: Sensor, number: int = 0, reading: CloudR
     """
     file = folder / "boxes.json"
     record = read_json(file, what="the boxes of a keyframe")
-    try:
+    with refusing(f"{file}: a field is missing or of another kind"):
         record = record[number] if isinstance(record, list) else record
         rows = [b for b in record["boxes"] if b["class"] in NUSCENES_CLASSES]
         boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in LIMITS] for b in rows])
         count = "num_lidar_pts" if all("num_lidar_pts" in b for b in rows) else "num_lidar_pts_at_key_frame"
         counts = np.array([int(b[count]) for b in rows], np.int32)
         cloud = folder / str(record["lidar_file"])
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{file}: a field is missing or of another kind: {error}") from None
     boxes = boxes.reshape(-1, 9)
     check_boxes(boxes, lambda i: f"{file}: box {i} of the ten classes")
     labels = np.array([NUSCENES_CLASSES.index(b["class"]) for b in rows], np.int32)

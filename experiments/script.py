@@ -48,12 +48,7 @@ def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> N
     written = compact_json({**record, **hardware()})
     print(text or written, flush=True)
     file = out or Path("outputs", f"{Path(sys.argv[0]).stem}.json")
-    write_text(file, written + "\n")
-
-
-def write_text(file: Path, text: str) -> None:
-    """Replace a file by a text, atomically."""
-    atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
+    atomic_write(file, written + "\n")
 
 
 def compact_json(value: Any, depth: int = 2) -> str:

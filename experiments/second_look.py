@@ -15,11 +15,10 @@ import numpy as np
 import optax
 from numpy.lib.format import open_memmap
 
-from experiments.script import write_text
 from fcos_lidar_jax.augment import augment
 from fcos_lidar_jax.config import Config, OptimizerConfig, RefinementConfig, config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.files import checksum, read_json
+from fcos_lidar_jax.files import atomic_write, checksum, read_json
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import build_detector
@@ -118,8 +117,10 @@ def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: in
         first_batch = next(batches)
         shapes = jax.eval_shape(find, jax.random.key(seed), first_batch.batch)
         leaves, tree = jax.tree.flatten(shapes)
+        folder.mkdir(parents=True, exist_ok=True)
+        mode = "r+" if done else "w+"  # an existing file knows its type and shape
         stored = [
-            _array(folder / f"{i}.npy", (samples, *leaf.shape), leaf.dtype, begun=done > 0)
+            open_memmap(folder / f"{i}.npy", mode, leaf.dtype, (samples, *leaf.shape))
             for i, leaf in enumerate(leaves)
         ]
         for number, host in zip(range(done, samples), itertools.chain([first_batch], batches), strict=False):
@@ -129,7 +130,7 @@ def _found(first: TrainedDetector, config: Config, frames: FrameSet, samples: in
             if (number + 1) % _SAVE_EVERY == 0 or number + 1 == samples:
                 for array in stored:
                     array.flush()
-                write_text(folder / _DONE, f'{{"of": "{of}", "done": {number + 1}}}\n')
+                atomic_write(folder / _DONE, f'{{"of": "{of}", "done": {number + 1}}}\n')
             progress.show(number + 1)
     return jax.tree.unflatten(tree, stored)
 
@@ -143,8 +144,3 @@ def _done(folder: Path, of: str) -> int:
     if stored["of"] != of:
         raise ValueError(f"{folder}: found the boxes of another training, expected another folder")
     return int(stored["done"])
-
-
-def _array(file: Path, shape: tuple[int, ...], dtype: Any, *, begun: bool) -> np.memmap:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    return open_memmap(file, "r+") if begun else open_memmap(file, "w+", dtype=dtype, shape=shape)

@@ -45,14 +45,14 @@ from experiments.changes import SLIM, change
 from experiments.hardware import hardware, peak_memory_gib
 from experiments.pool import simulating
 from experiments.runs import trained, training_steps
-from experiments.script import compact_json, run_script, write_text
+from experiments.script import compact_json, run_script
 from experiments.studies import ladder
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.config import Config, RefinementConfig
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.input_pipeline.database import cut_reading
@@ -243,7 +243,7 @@ def keep(args: Args, part: str, name: str, row: dict[str, Any], where: dict[str,
     """Write a row to the file of its part, and where it was measured."""
     record = stored(args, part)
     whole = {**record, **where, "rows": {**record["rows"], name: row}}
-    write_text(args.out / f"{part}.json", compact_json(whole) + "\n")
+    atomic_write(args.out / f"{part}.json", compact_json(whole) + "\n")
 
 
 def in_process(args: Args, part: str, name: str, measure: Callable[[Args], dict[str, Any]], log: Path) -> None:

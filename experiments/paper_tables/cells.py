@@ -17,10 +17,10 @@ from typing import Any
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from experiments.paper_tables.scales import Scale
-from experiments.script import compact_json, write_text
+from experiments.script import compact_json
 from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
 from fcos_lidar_jax.config import Config, RefinementConfig, config_to_json
-from fcos_lidar_jax.files import file_lock, read_json
+from fcos_lidar_jax.files import atomic_write, file_lock, read_json
 
 Cell = dict[str, Any]  # ``changes``, ``seed``, ``scores`` or ``diverged``, and hardware.
 _CELLS, _SCALE, _LOCK = "cells.csv", "scale.json", "cells.lock"
@@ -84,8 +84,8 @@ def add_cell(folder: Path, scale: Scale, cell: Cell, *, locks: Path) -> Cell:
         writer.writeheader()
         writer.writerows(rows)
         if not (folder / _SCALE).is_file():
-            write_text(folder / _SCALE, compact_json(_shared(scale)) + "\n")
-        write_text(folder / _CELLS, text.getvalue())
+            atomic_write(folder / _SCALE, compact_json(_shared(scale)) + "\n")
+        atomic_write(folder / _CELLS, text.getvalue())
     return read_cells(folder, scale)[cell["changes"], cell["seed"]]
 
 

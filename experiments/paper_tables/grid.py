@@ -14,10 +14,9 @@ from pathlib import Path
 from experiments.hardware import hardware
 from experiments.paper_tables.cells import Cell, add_cell, changes_of, read_cells, run_name
 from experiments.paper_tables.scales import Scale
-from experiments.script import write_text
 from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.files import file_lock
+from fcos_lidar_jax.files import atomic_write, file_lock
 from fcos_lidar_jax.training import NonFiniteLossError
 
 _POLL_S = 5.0  # Interval of looking for the results of other processes, seconds.
@@ -75,5 +74,5 @@ def _add_revision(folder: Path, revision: str) -> list[str]:
     file = folder / "revisions.txt"
     before = file.read_text(encoding="utf-8").split() if file.is_file() else []
     revisions = before if before[-1:] == [revision] else [*before, revision]
-    write_text(file, "\n".join(revisions))
+    atomic_write(file, "\n".join(revisions))
     return revisions

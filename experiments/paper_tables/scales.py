@@ -34,7 +34,7 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.metrics import evaluate
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
 from fcos_lidar_jax.evaluation.truth import split_truth
-from fcos_lidar_jax.files import checksum, file_lock
+from fcos_lidar_jax.files import checksum, file_lock, refusing
 from fcos_lidar_jax.inference import CloudDetector, Prediction
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline import database
@@ -217,10 +217,8 @@ class NuScenesLayout:
         whole = dataclasses.replace(self, version=data.version, index=self.index or data.index, **splits)
         whole.describe()
         if self.test_version is not None:  # before days of training
-            try:
+            with refusing("--test-version", ValueError):
                 whole.frames("test", whole.base, self.test_version).frame(0)
-            except ValueError as error:
-                raise ValueError(f"--test-version: {error}") from None
         return whole
 
     @property

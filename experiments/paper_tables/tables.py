@@ -17,10 +17,10 @@ from experiments.paper import PAPER
 from experiments.paper_tables.cells import Cell
 from experiments.paper_tables.grid import run_cells
 from experiments.paper_tables.scales import NuScenesLayout, Scale, Simulated, quarter, smoke
-from experiments.script import compact_json, write_text
+from experiments.script import compact_json
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
 from fcos_lidar_jax.config import config_to_json
-from fcos_lidar_jax.files import file_lock
+from fcos_lidar_jax.files import atomic_write, file_lock
 
 SCORES = ("mAP", "NDS")
 
@@ -141,8 +141,8 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
         # Scores and training data are in the files of the cells.
         rows = [{name: value for name, value in row.items() if name != "scores"} for row in record["rows"]]
         written = {**{name: value for name, value in record.items() if name != "trained_on"}, "rows": rows, **here}
-        write_text(file.with_suffix(".json"), compact_json(written, 3) + "\n")
-        write_text(file.with_suffix(".md"), text)
+        atomic_write(file.with_suffix(".json"), compact_json(written, 3) + "\n")
+        atomic_write(file.with_suffix(".md"), text)
         if any(cell and "curve" in cell for row in record["rows"] for cell in row.get("scores", ())):
             draw_learning(table, record, file.with_name(f"{file.name}_curves.png"))
     return record

@@ -55,13 +55,6 @@ CONFIG = change(
 )(small_network(QUICKSTART))
 
 
-@dataclasses.dataclass(frozen=True)
-class Args(Options):
-    """Options of the comparison."""
-
-    quick: bool = False  # Only five steps in float64, on one device and on two.
-
-
 def batch_of(step: int) -> Batch:
     """Make very unequal samples: the first without boxes, the second without points, the third with one box."""
     frames = []
@@ -99,21 +92,19 @@ def draw_variables(detector: Detector, dtype: str) -> Any:
     return jax.tree_util.tree_map_with_path(draw, jax.eval_shape(detector.init, jax.random.key(0)))
 
 
-def measure(out: Path, mesh: Mesh, dtype: str, *, gradient: bool) -> None:
-    """Compute five steps on one mesh, and optionally one gradient."""
+def measure(out: Path, mesh: Mesh, dtype: str) -> None:
+    """Compute one gradient and five steps on one mesh."""
     detector, optimizer = build_detector(CONFIG, SENSOR), make_optimizer(CONFIG.optimizer, STEPS)
     start = make_state(detector, optimizer, jax.random.key(1), variables=draw_variables(detector, dtype))
     state, process, processes = replicate(start, mesh), jax.process_index(), jax.process_count()
     rows = slice(process * SIZE // processes, (process + 1) * SIZE // processes)
     batches = [shard_batch(jax.tree.map(lambda leaf: leaf[rows], batch_of(i)), mesh) for i in range(STEPS)]
-    results: dict[str, Any] = {}
-    if gradient:
-        on_all = functools.partial(jax.jit, out_shardings=NamedSharding(mesh, PartitionSpec()))
-        of_batch = on_all(make_gradient(detector))(state.params, state.batch_stats, batches[0])
-        results |= zip(("gradient", "statistics", "metrics"), of_batch, strict=True)
-        results["targets"] = on_all(functools.partial(_targets_of, detector))(state, batches[0])
-        if processes == 1:
-            results["mapped"] = _mapped_step(make_train_step(detector, optimizer), start, mesh)
+    on_all = functools.partial(jax.jit, out_shardings=NamedSharding(mesh, PartitionSpec()))
+    of_batch = on_all(make_gradient(detector))(state.params, state.batch_stats, batches[0])
+    results: dict[str, Any] = dict(zip(("gradient", "statistics", "metrics"), of_batch, strict=True))
+    results["targets"] = on_all(functools.partial(_targets_of, detector))(state, batches[0])
+    if processes == 1:
+        results["mapped"] = _mapped_step(make_train_step(detector, optimizer), start, mesh)
     step = jit_step(make_train_step(detector, optimizer), mesh)
     for i, batch in enumerate(batches):
         state, metrics = step(state, batch)
@@ -138,9 +129,7 @@ def _mapped_step(step: Any, start: TrainState, mesh: Mesh) -> tuple[Any, ...]:
     return jax.tree.map(lambda leaf: leaf[0], _outcome(*pmap_step(step, mesh)(state, batch)))
 
 
-def work(
-    folder: Path, sizes: list[int], processes: int, process: int, port: int, dtype: str, gradient: bool
-) -> None:
+def work(folder: Path, sizes: list[int], processes: int, process: int, port: int, dtype: str) -> None:
     """Measure on all meshes, as one of several processes."""
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_num_cpu_devices", max(sizes) // processes)
@@ -149,16 +138,16 @@ def work(
         jax.distributed.initialize(f"localhost:{port}", processes, process)
     for size in sizes:
         mesh = make_mesh(jax.devices()[:size])
-        measure(folder / f"{size}-{processes}-{dtype}.npz", mesh, dtype, gradient=gradient)
+        measure(folder / f"{size}-{processes}-{dtype}.npz", mesh, dtype)
 
 
-def launch(folder: Path, sizes: list[int], processes: int, dtype: str, *, gradient: bool) -> None:
+def launch(folder: Path, sizes: list[int], processes: int, dtype: str) -> None:
     """Measure in new processes, which write NPZ files into a folder."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        started = [pool.submit(work, folder, sizes, processes, i, port, dtype, gradient) for i in range(processes)]
+        started = [pool.submit(work, folder, sizes, processes, i, port, dtype) for i in range(processes)]
         for process in started:
             process.result()
 
@@ -173,30 +162,27 @@ def _compare(folder: Path, devices: int, processes: int, dtype: str) -> dict[str
     meshes = f"1-1-{dtype}", f"{devices}-{processes}-{dtype}", "1-1-float64"
     one, many, exact = (dict(np.load(folder / f"{mesh}.npz")) for mesh in meshes)
     record: dict[str, Any] = {"devices": devices, "processes": processes, "dtype": dtype}
-    if targets := [name for name in one if name.startswith("['targets']")]:
-        record["targets_identical"] = all(np.array_equal(one[name], many[name]) for name in targets)
-        record["k_of_samples"] = one["['targets'][2]"].sum(axis=1).tolist()
-        record |= {part: _difference(one, many, part) for part in ("gradient", "statistics", "metrics")}
-        record["rounding"] = _difference(exact, one, "gradient")
+    targets = [name for name in one if name.startswith("['targets']")]
+    record["targets_identical"] = all(np.array_equal(one[name], many[name]) for name in targets)
+    record["k_of_samples"] = one["['targets'][2]"].sum(axis=1).tolist()
+    record |= {part: _difference(one, many, part) for part in ("gradient", "statistics", "metrics")}
+    record["rounding"] = _difference(exact, one, "gradient")
     if mapped := {name.replace("mapped", "step"): many[name] for name in many if name.startswith("['mapped']")}:
         record["step"], record["step_by_pmap"] = (_difference(one, other, "step") for other in (many, mapped))
         record["losses"] = [float(each["['step'][3]"]) for each in (one, many, mapped)]
     return record | {"after_five_steps": _difference(one, many, "after")}
 
 
-def measure_all(args: Args) -> dict[str, Any]:
+def measure_all(_: Options) -> dict[str, Any]:
     """Measure on all meshes and compare."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if args.quick:
-            launch(folder, [1, 2], 1, "float64", gradient=False)
-        else:
-            for dtype in ("float32", "float64"):
-                launch(folder, [1, 2, 4, 8], 1, dtype, gradient=True)
-                launch(folder, [8], 2, dtype, gradient=True)
+        for dtype in ("float32", "float64"):
+            launch(folder, [1, 2, 4, 8], 1, dtype)
+            launch(folder, [8], 2, dtype)
         meshes = [file.stem.split("-") for file in sorted(folder.glob("*.npz"))]
         return {"meshes": [_compare(folder, int(d), int(p), dtype) for d, p, dtype in meshes if d != "1"]}
 
 
 if __name__ == "__main__":
-    run_measurement(measure_all, Args, __doc__)
+    run_measurement(measure_all, Options, __doc__)

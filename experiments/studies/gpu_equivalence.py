@@ -10,7 +10,7 @@ wins in every cell, and ranges and angles differ by rounding; in full float32 al
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from fcos_lidar_jax.types import CHANNELS, Detections
 
 _NEAR_M = 0.5  # Boxes of one class whose centres are at most this far apart are the same object.
 _SCENES = {"scene-0523, odd": 10, "scene-0103": 2, "scene-0061": 1}  # Keyframes per scene.
+_PRECISIONS = ("highest", "default")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,21 +82,19 @@ def compare_detections(
         for name, number in _SCENES.items()
         for i in range(number)
     ]
+    record = {}
     expected = _detect(cpu, detector, clouds, "highest")
-    results = {
-        precision: [_match(a, b) for a, b in zip(expected, _detect(gpu, detector, clouds, precision), strict=True)]
-        for precision in ("highest", "default")
-    }
-    return {
-        precision: {
-            "boxes_on_cpu": sum(m["cpu"] for m in matches),
-            "boxes_on_gpu": sum(m["gpu"] for m in matches),
-            "found_on_both": sum(len(m["apart_m"]) for m in matches),
-            "largest_distance_m": round(max(max(m["apart_m"], default=0.0) for m in matches), 5),
-            "largest_score_difference": round(max(max(m["scores"], default=0.0) for m in matches), 5),
+    for precision in _PRECISIONS:
+        found = _detect(gpu, detector, clouds, precision)
+        pairs = [pair for a, b in zip(expected, found, strict=True) for pair in _pairs(a, b)]
+        record[precision] = {
+            "boxes_on_cpu": sum(int(boxes.valid.sum()) for boxes in expected),
+            "boxes_on_gpu": sum(int(boxes.valid.sum()) for boxes in found),
+            "found_on_both": len(pairs),
+            "largest_distance_m": round(max((apart for apart, _ in pairs), default=0.0), 5),
+            "largest_score_difference": round(max((score for _, score in pairs), default=0.0), 5),
         }
-        for precision, matches in results.items()
-    }
+    return record
 
 
 def _detect(device: Any, detector: TrainedDetector, clouds: list[Any], precision: str) -> list[Detections]:
@@ -104,18 +103,14 @@ def _detect(device: Any, detector: TrainedDetector, clouds: list[Any], precision
         return [jax.device_get(detect(detector.variables, cloud.points, cloud.valid)) for cloud in clouds]
 
 
-def _match(first: Detections, second: Detections) -> dict[str, Any]:
-    """Distances and differences of scores between boxes and the nearest of the same class on the other device."""
-    used = np.flatnonzero(first.valid)
-    apart, scores = [], []
-    for row in used:
+def _pairs(first: Detections, second: Detections) -> Iterator[tuple[float, float]]:
+    """Distance and difference of scores of each box and the nearest of the same class on the other device."""
+    for row in np.flatnonzero(first.valid):
         same = np.flatnonzero(second.valid & (second.labels == first.labels[row]))
         distance = np.linalg.norm(second.boxes[same, :3] - first.boxes[row, :3], axis=1)
         if len(same) and distance.min() <= _NEAR_M:
             nearest = same[distance.argmin()]
-            apart.append(float(distance.min()))
-            scores.append(float(abs(second.scores[nearest] - first.scores[row])))
-    return {"cpu": len(used), "gpu": int(second.valid.sum()), "apart_m": apart, "scores": scores}
+            yield float(distance.min()), float(abs(second.scores[nearest] - first.scores[row]))
 
 
 def compare_gradients(cpu: Any, gpu: Any, detector: TrainedDetector, frames: FrameSet) -> dict[str, float]:
@@ -134,7 +129,7 @@ def compare_gradients(cpu: Any, gpu: Any, detector: TrainedDetector, frames: Fra
             float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-12))
             for a, b in zip(expected, compute(gpu, precision), strict=True)
         )
-        for precision in ("highest", "default")
+        for precision in _PRECISIONS
     }
 
 

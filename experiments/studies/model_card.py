@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import fcos_lidar_jax
-from experiments.script import run_script, write_text
+from experiments.script import run_script
 from fcos_lidar_jax.checkpoints.storage import read_description
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models.detector import count_parameters
 
@@ -57,7 +57,7 @@ def write_card(name: str, results: Path, training: Mapping[str, Any] | None = No
     figures = _figures(record, results / "transfer.json", weights)
     lines = [*_about(name, record), *figures, *_training(name, record)]
     path = folder / "README.md"
-    write_text(path, "\n".join(lines) + "\n")
+    atomic_write(path, "\n".join(lines) + "\n")
     return path
 
 

@@ -48,7 +48,7 @@ from experiments.changes import change
 from experiments.hardware import hardware
 from experiments.pool import PooledFrames, simulating
 from experiments.runs import detections, trained
-from experiments.script import Options, compact_json, run_script, save, write_text
+from experiments.script import Options, compact_json, run_script, save
 from experiments.second_look import USES, look_again, look_config
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
@@ -63,7 +63,7 @@ from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, KITTI_COMPACT, QUICKSTART
@@ -196,7 +196,7 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     with simulating(pool, args.simulators):
         trained(work, config, PooledFrames(pool), **run, schedule=schedule)
     record = {"streets": len(pool.made()), "device": hardware()["device"]}
-    write_text(work / _POOLED, compact_json(record) + "\n")
+    atomic_write(work / _POOLED, compact_json(record) + "\n")
     return training_record(work)
 
 
@@ -223,7 +223,7 @@ def train_second_look(args: Args, work: Path, config: Config) -> dict[str, Any]:
         "num_boxes": config.refinement.num_boxes,
         "num_points": config.refinement.num_points,
     }
-    write_text(work / _LOOK, compact_json(record) + "\n")
+    atomic_write(work / _LOOK, compact_json(record) + "\n")
     return record
 
 
