@@ -43,7 +43,6 @@ _MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- e
 class Args:
     """Options of the ledger."""
 
-    results: Path = RESULTS  # Folder of the figures.
     write: bool = False  # Write the ledger into experiments/README.md.
 
 
@@ -177,20 +176,20 @@ def gains_of(
     return gains
 
 
-def figure_lines(results: Path) -> Iterator[str]:
+def figure_lines() -> Iterator[str]:
     """Yield a line of Markdown for each claim that needs no training."""
     for figure in FIGURES:
-        ours = figure.value(read_json(results / f"{figure.file}.json", dict[str, Any]))
+        ours = figure.value(read_json(RESULTS / f"{figure.file}.json", dict[str, Any]))
         said = verdict_of_figure(figure, ours)
         paper = f"more than {figure.paper:g}" if figure.above else f"{figure.paper:.3g}"
         source = f"[{figure.file}](results/{figure.file}.json)"
         yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} |"
 
 
-def claim_lines(results: Path, score: str) -> Iterator[str]:
+def claim_lines(score: str) -> Iterator[str]:
     """Yield a line of Markdown for each claim about a score."""
     scale = quarter(Path("unused"))
-    cells = read_cells(results / "tables" / scale.name, scale)
+    cells = read_cells(RESULTS / "tables" / scale.name, scale)
     for claim in CLAIMS:
         table, *rows = claim.paper
         theirs, reference = (PAPER["tables"][table]["rows"][row][score] for row in rows)
@@ -212,12 +211,12 @@ def _table(columns: str, lines: Iterable[str]) -> str:
     return "\n".join((f"| {columns} |", "|---" * (columns.count("|") + 1) + "|", *lines))
 
 
-def as_markdown(results: Path) -> str:
+def as_markdown() -> str:
     """Format the whole ledger."""
-    parts = [_table("without training | paper | here | from | verdict", figure_lines(results))]
+    parts = [_table("without training | paper | here | from | verdict", figure_lines())]
     for score in SCORES:
         columns = f"gain in points of {score} | paper | {' | '.join(NETWORKS)}"
-        parts.append(_table(columns, claim_lines(results, score)))
+        parts.append(_table(columns, claim_lines(score)))
     return "\n\n".join([*parts, _OUR_NDS]) + "\n"
 
 
@@ -230,7 +229,7 @@ def with_ledger(document: str, ledger: str) -> str:
 
 def main(args: Args) -> None:
     """Print the ledger, and optionally write it."""
-    ledger = as_markdown(args.results)
+    ledger = as_markdown()
     print(ledger, end="", flush=True)
     if args.write:
         atomic_write(README, with_ledger(README.read_text(encoding="utf-8"), ledger))

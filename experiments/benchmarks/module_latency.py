@@ -8,13 +8,13 @@ repeats take some minutes on two CPU cores. README.md has the result.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from experiments.paper import PAPER, TIMES_NOTE
+from experiments.paper import PAPER
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.inference.timing import Call, interleaved
@@ -118,18 +118,6 @@ def measure(args: Args, only: Collection[str] = VARIANTS) -> dict[str, Any]:
             "paper": _paper_times(variant),
         }
     return {"variants": records, "precision": args.precision, "repeats": args.repeats}
-
-
-def figures(names: Mapping[str, str], args: Args) -> dict[str, Any]:
-    """Measure figures for a table of the paper; ``names`` maps the labels of its rows to variants."""
-    measured = measure(args, names.values())
-    columns: dict[str, dict[str, float]] = {}
-    for label, name in names.items():
-        ours = measured["variants"][name]
-        theirs = next(iter(ours["paper"].values()))
-        columns[label] = {"module, ms": ours["median_ms"], "ratio": ours["ratio"]}
-        columns[label] |= {"module, ms, paper": theirs["time_ms"], "ratio, paper": theirs["ratio"]}
-    return {"columns": columns, "lines": [TIMES_NOTE]}
 
 
 if __name__ == "__main__":

@@ -3,10 +3,10 @@
 from functools import partial
 from typing import Any
 
-from experiments.benchmarks import latency, mrv_figures
+from experiments.benchmarks import latency, module_latency, mrv_figures
 from experiments.changes import change
 from experiments.paper import TIMES_NOTE
-from experiments.paper_tables.tables import Args, Row, Table, simulated_scale, stem_times
+from experiments.paper_tables.tables import Args, Row, Table, simulated_scale
 
 _SWEEPS = {"single": 1, "multi": 10}  # Setting -> fused sweeps.
 _GROUPS = ("one group", "5 modalities", "9 types", "9 types, rounds apart")
@@ -45,6 +45,18 @@ def _current_points(args: Args) -> dict[str, Any]:
     rows = {"without priority": "not prioritized", "with priority": "prioritized"}
     current = {row: mean[name]["current"][str(scale.base.projection.num_rounds)] for row, name in rows.items()}
     return {"columns": {row: {"current points kept, this scale": number} for row, number in current.items()}}
+
+
+def _stem_times(variants: dict[str, str], args: Args) -> dict[str, Any]:
+    """Times of the stem; ``variants`` maps the labels of rows to variants of ``module_latency.py``."""
+    options = module_latency.Args(repeats=2 if args.scale == "smoke" else 15, precision=args.nuscenes.precision)
+    measured, columns = module_latency.measure(options, variants.values())["variants"], {}
+    for label, name in variants.items():
+        ours = measured[name]
+        theirs = next(iter(ours["paper"].values()))
+        columns[label] = {"module, ms": ours["median_ms"], "ratio": ours["ratio"]}
+        columns[label] |= {"module, ms, paper": theirs["time_ms"], "ratio, paper": theirs["ratio"]}
+    return {"columns": columns, "lines": [TIMES_NOTE]}
 
 
 def _stage_times(args: Args) -> dict[str, Any]:
@@ -101,7 +113,7 @@ PAPER_TABLES = (
             Row("9 types, rounds apart", change(model__stem__group_rounds=False), "9 groups, rounds not grouped"),
         ),
         reference="one group",
-        figures=partial(stem_times, {name: name for name in _GROUPS}),
+        figures=partial(_stem_times, {name: name for name in _GROUPS}),
     ),
     # The paper: two convolutions gain 1.3 mAP over one; a third gains nothing.
     Table(
@@ -109,7 +121,7 @@ PAPER_TABLES = (
         "Table 4: layers of modality-wise convolutions",
         tuple(Row(f"{n}", change(model__stem__num_convs=n), str(n)) for n in (1, 2, 3)),
         reference="1",
-        figures=partial(stem_times, {"1": "1 convolution", "2": "9 types", "3": "3 convolutions"}),
+        figures=partial(_stem_times, {"1": "1 convolution", "2": "9 types", "3": "3 convolutions"}),
     ),
     # The paper: (1, 3, 6) gains 1.2 mAP over (1,) and 0.45 over three equal branches.
     Table(

@@ -45,11 +45,9 @@ def submission(args: Args) -> list[str]:
         return ["No results file: no --test-version."]
     config = wide(faded(scale.base))
     changes = changes_of(config, scale.base)
-    known = read_cells(args.out / args.scale, scale).get((changes, seed))
-    if known is None:
-        return [f'No results file: the row "{_SUBMITTED}" was not trained with seed {seed}.']
-    if "diverged" in known:
-        return [f"No results file: the training of seed {seed} diverged."]
+    cell = read_cells(args.out / args.scale, scale).get((changes, seed), {})
+    if "scores" not in cell:
+        return [f'No results file: the row "{_SUBMITTED}" has no scores with seed {seed}.']
     run = args.runs / args.scale / run_name(changes, seed)
     kept = Checkpoints(run / CHECKPOINTS).paths()
     if not kept or int(kept[-1].name) != read_json(run / RUN_SPEC, dict[str, Any])["steps"]:

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from experiments.benchmarks import module_latency
 from experiments.benchmarks.latency import real_cloud
 from experiments.changes import Change
 from experiments.hardware import hardware
@@ -112,14 +111,6 @@ def simulated_scale(args: Args) -> Simulated | None:
 def make_scale(args: Args) -> Simulated | NuScenesLayout:
     """Create the selected scale."""
     return simulated_scale(args) or args.nuscenes.checked()
-
-
-def stem_times(variants: dict[str, str], args: Args) -> dict[str, Any]:
-    """Measure the stem for a table; ``variants`` maps labels to variants of ``module_latency.py``."""
-    repeats = 2 if args.scale == "smoke" else 15
-    return module_latency.figures(
-        variants, module_latency.Args(repeats=repeats, precision=args.nuscenes.precision)
-    )
 
 
 def run_table(table: Table, args: Args) -> dict[str, Any]:

@@ -36,7 +36,6 @@ class Args:
     """Options of the model card."""
 
     name: Literal["quickstart", "hdl32e", "hdl64e"]  # Name of the weights.
-    results: Path = RESULTS  # Folder of the figures.
 
 
 def write_card(name: str, results: Path, training: Mapping[str, Any] | None = None) -> Path:
@@ -151,7 +150,7 @@ def _text(interval: Any) -> str:
 
 def main(args: Args) -> None:
     """Write the card and print its path."""
-    print(write_card(args.name, args.results))
+    print(write_card(args.name, RESULTS))
 
 
 if __name__ == "__main__":

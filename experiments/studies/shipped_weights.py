@@ -62,9 +62,9 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFr
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
-from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
+from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.files import atomic_write, read_json
-from fcos_lidar_jax.inference import TrainedDetector, load_trained
+from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, KITTI_COMPACT, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
@@ -180,7 +180,7 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     if args.learning_rate is not None:
         config = change(optimizer__peak_learning_rate=args.learning_rate)(config)
     # Rejects before hours of training what the export would reject.
-    earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
+    earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed})
     if args.second_look:
         return train_second_look(args, work, config)
     number = _POOL // config.optimizer.batch_size if args.simulators else args.steps
@@ -227,13 +227,6 @@ def train_second_look(args: Args, work: Path, config: Config) -> dict[str, Any]:
     return record
 
 
-def evaluated(detector: TrainedDetector, number: int) -> Evaluation:
-    """Evaluate a detector on unseen frames."""
-    _, unseen = streets(detector.config, steps=1, seed=0)
-    found, frames = detections(detector, SelectedFrames(unseen, tuple(range(number))))
-    return evaluate_frames(found, frames, metric_of(detector.classes))
-
-
 def training_record(run: Path) -> dict[str, Any]:
     """Summarise the training of a run."""
     if (run / _LOOK).exists():
@@ -256,9 +249,9 @@ def training_record(run: Path) -> dict[str, Any]:
     }
 
 
-def earlier_trainings(name: str, training: Mapping[str, Any], results: Path) -> list[dict[str, Any]]:
+def earlier_trainings(name: str, training: Mapping[str, Any]) -> list[dict[str, Any]]:
     """List the trainings before a warm start, as recorded by the last export."""
-    file = results / f"{name}.json"
+    file = RESULTS / f"{name}.json"
     if training["begun_with"] != name or not file.exists():
         return []
     before = read_json(file, dict[str, Any])
@@ -299,7 +292,10 @@ def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
 def scores(args: Args) -> dict[str, Any]:
     """Score the weights in the package on unseen frames."""
     folder = SHIPPED / args.name
-    evaluation = evaluated(load_trained(folder), args.test_frames)
+    detector = load_trained(folder)
+    _, unseen = streets(detector.config, steps=1, seed=0)
+    found, frames = detections(detector, SelectedFrames(unseen, tuple(range(args.test_frames))))
+    evaluation = evaluate_frames(found, frames, metric_of(detector.classes))
     return {
         "name": args.name,
         "hash": read_description(folder)["hash"],
@@ -313,7 +309,7 @@ def scores(args: Args) -> dict[str, Any]:
 def export(args: Args, work: Path) -> dict[str, Any]:
     """Write the weights of the newest checkpoint and their model card; returns training and scores."""
     folder, training = SHIPPED / args.name, training_record(work)
-    earlier = earlier_trainings(args.name, training, RESULTS)
+    earlier = earlier_trainings(args.name, training)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     share = _LOGIT_ADJUSTMENT.get(args.name)
     if share and "trained" not in training:  # The logits of a frozen detector are adjusted already.
