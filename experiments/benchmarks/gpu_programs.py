@@ -202,9 +202,10 @@ def compile_program(program: Program) -> dict[str, Any]:
     )
     mesh = Mesh(topology.devices, ("data",), axis_types=(AxisType.Auto,))
     everywhere, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("data"))
-    function, given, split, donated = _function(program)
-    shardings = tuple(rows if divided else everywhere for divided in split)
-    jitted = jax.jit(function, in_shardings=shardings, out_shardings=everywhere, donate_argnums=donated)
+    function, given = _function(program)
+    training: dict[str, Any] = {"in_shardings": (everywhere, rows), "donate_argnums": 0}  # a state and a batch
+    options = training if program.kind == "train" else {"in_shardings": everywhere}
+    jitted = jax.jit(function, out_shardings=everywhere, **options)
     began = time.monotonic()
     lowered = jitted.lower(*given)
     compiled = lowered.compile()
@@ -231,8 +232,8 @@ def compile_program(program: Program) -> dict[str, Any]:
     return record
 
 
-def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...], tuple[int, ...]]:
-    """Return a function, its arguments' shapes, which of them are split over devices, and which are donated."""
+def _function(program: Program) -> tuple[Any, tuple[Any, ...]]:
+    """Return a function and its arguments' shapes."""
 
     def spec(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, dtype)
@@ -250,18 +251,16 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(export_detector(load_trained(program.preset)))
         exported = load_exported(file).exported
-        clouds = spec(1, n, c), spec(1, n, dtype=jnp.bool_), spec(dtype=jnp.bool_)
-        return exported.call, clouds, (False,) * 3, ()
+        return exported.call, (spec(1, n, c), spec(1, n, dtype=jnp.bool_), spec(dtype=jnp.bool_))
     detector = build_detector(config, sensor)
     optimizer = make_optimizer(config.optimizer, 1000)
     state = jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(0))
     if program.kind == "detect":
         variables = {"params": state.params, "batch_stats": state.batch_stats}
-        return make_detect(detector), (variables, spec(n, c), spec(n, dtype=jnp.bool_)), (False,) * 3, ()
+        return make_detect(detector), (variables, spec(n, c), spec(n, dtype=jnp.bool_))
     clouds = spec(b, n, c), spec(b, n, dtype=jnp.bool_)
     arrays: Any = (*clouds, spec(b, m, 9), spec(b, m, dtype=jnp.int32), spec(b, m, dtype=jnp.bool_))
-    batch = Batch(*arrays)
-    return make_train_step(detector, optimizer), (state, batch), (False, True), (0,)
+    return make_train_step(detector, optimizer), (state, Batch(*arrays))
 
 
 def count_kernels(module: str) -> tuple[int, list[tuple[int | None, int]]]:

@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from experiments.cached import CachedFrames
-from experiments.changes import SLIM, change
+from experiments.changes import AHEAD, BONNET_M, SLIM, change
 from experiments.pool import simulating
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
@@ -52,7 +52,6 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 _LOOK_SAMPLES = 2000  # Augmented frames in which boxes are found for a second look.
 _CURVE_FRAMES = 100  # Test frames of evaluations during training.
 _PROCESSES = 4  # Processes assumed to share the cores, so that each reads frames with a quarter of the threads.
-_BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, which leaves a trail in fused sweeps.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +97,7 @@ class Simulated:
             "train_frames": self.train_frames,
             "test_frames": self.test_frames,
             "sweeps": self.base.num_sweeps,
-            "close_m": _BONNET_M,
+            "close_m": BONNET_M,
         }
 
     def check(self, config: Config) -> None:
@@ -115,7 +114,7 @@ class Simulated:
         """Training or test frames, with the same streets and sweeps for each number of sweeps."""
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, UNSEEN_SEED)}[split]
         sweeps = self.base.num_sweeps
-        reading, extent = CloudReading(sweeps, "all", _BONNET_M), (self.num_objects, self.reach_m, self.min_points)
+        reading, extent = CloudReading(sweeps, "all", BONNET_M), (self.num_objects, self.reach_m, self.min_points)
         made = SimulatedFrames(self.sensor, number, first, *extent, reading, streets=self.streets)
         return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
 
@@ -319,7 +318,7 @@ _TOY = change(
     copy_paste=None,
     class_balanced=False,
     augment=None,
-    projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
+    projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=BONNET_M),
     # Table 3 needs at least as many channels per type as rounds.
     model__stem=StemConfig(channels_per_type=5, out_channels=8),
     inference=InferenceConfig(max_detections=50, candidates_per_level=100),
@@ -337,18 +336,11 @@ _SECTOR = change(
     name="sector",
     num_sweeps=10,
     max_points=81_920,
-    max_boxes=64,
-    copy_paste=None,
-    class_balanced=False,
-    projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
-    model__circular_width=False,
+    **AHEAD,
     model__local_geometry=False,
     # Wider than SLIM, for the 45 inputs of five rounds.
     model__stem__channels_per_type=8,
     model__stem__out_channels=24,
-    # Larger rotations leave the sector, and a mirrored street would face backwards.
-    augment__flip_y_probability=0.0,
-    augment__max_rotation_rad=math.radians(5),
     optimizer__ema_decay=0.998,
     optimizer__epochs=2,
 )(SLIM(COMPACT))

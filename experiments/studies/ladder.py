@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.cached import CachedFrames
-from experiments.changes import LARGER, LONE_LOOK, QUARTER_LOOK, SLIM, Change, change
+from experiments.changes import AHEAD, BONNET_M, LARGER, LONE_LOOK, QUARTER_LOOK, SLIM, Change, change
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
@@ -44,7 +44,7 @@ from fcos_lidar_jax.data.frame import SelectedFrames
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models import count_parameters
-from fcos_lidar_jax.presets import COMPACT, NUSCENES
+from fcos_lidar_jax.presets import COMPACT
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.streets import CITY
@@ -54,20 +54,8 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
 DISTANCES_M = ("0.5", "1.0", "2.0", "4.0")
-_BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
 
-BASE: Change = change(
-    name="ladder",
-    max_points=12_288,
-    max_boxes=64,
-    copy_paste=None,
-    class_balanced=False,
-    projection=dataclasses.replace(NUSCENES.projection, num_rounds=1, remove_close="all", close_m=_BONNET_M),
-    model__circular_width=False,
-    # Larger rotations leave the sector, and a mirrored street would face backwards.
-    augment__flip_y_probability=0.0,
-    augment__max_rotation_rad=math.radians(5),
-)
+BASE: Change = change(name="ladder", max_points=12_288, **AHEAD, projection__num_rounds=1)
 _SMALL = "local geometry, joint, neighbours"
 
 
@@ -122,7 +110,7 @@ class Args(Options):
 def frames(work: Path, split: str) -> CachedFrames:
     """Open the frames of a split, which are simulated once."""
     number, first = {"train": (TRAIN_FRAMES, 0), "test": (TEST_FRAMES, UNSEEN_SEED)}[split]
-    reading, reach_m = CloudReading(1, "all", _BONNET_M), NUSCENES_HDL32E.limit_xy_m
+    reading, reach_m = CloudReading(1, "all", BONNET_M), NUSCENES_HDL32E.limit_xy_m
     made = SimulatedFrames(SENSOR, number, first, 60, reach_m, 1, reading, streets=CITY)
     return CachedFrames(made, work / f"frames_{split}_{number}")
 
