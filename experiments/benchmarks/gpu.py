@@ -41,7 +41,7 @@ import jax
 from experiments.benchmarks.latency import fused_cloud, padded, path_calls, simulated_sweeps, stage_calls
 from experiments.benchmarks.mrv_figures import mrv_times
 from experiments.benchmarks.train_speed import Function, Size, compare
-from experiments.changes import SLIM, change
+from experiments.changes import change
 from experiments.hardware import hardware, peak_memory_gib
 from experiments.pool import simulating
 from experiments.runs import trained, training_steps
@@ -198,7 +198,7 @@ def scores(args: Args, *, trial: str) -> dict[str, Any]:
     others = 0 if args.toy else max(len(os.sched_getaffinity(0)) - 2, 0)
     tests, frames = (ladder.frames(own.work, split) for split in ("test", "train"))
     with simulating(tests, min(others, 1)), simulating(frames, others):
-        return ladder.trial(trial, ladder.TRIALS[trial](ladder.BASE(SLIM(COMPACT))), 0, own)
+        return ladder.trial(trial, 0, own)
 
 
 _PRECISIONS: tuple[Precision, ...] = ("float32", "tf32", "bfloat16")

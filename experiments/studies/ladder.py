@@ -39,7 +39,7 @@ from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
+from fcos_lidar_jax.config import CloudReading, RefinementConfig
 from fcos_lidar_jax.data.frame import SelectedFrames
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.inference import load_trained
@@ -120,8 +120,9 @@ def run_folder(name: str, seed: int, args: Args) -> Path:
     return args.work / f"{name.replace(' ', '_').replace(',', '')}_{args.steps}_{seed}"
 
 
-def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
+def trial(name: str, seed: int, args: Args) -> dict[str, Any]:
     """Train a trial and score it."""
+    config = TRIALS[name](BASE(SLIM(COMPACT)))
     seen, tests = (frames(args.work, split) for split in ("train", "test"))
     curve_frames = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
     folder = run_folder(name, seed, args)
@@ -166,7 +167,7 @@ def measure(args: Args) -> None:
     for seed in args.seeds:
         for name in args.trials:
             if not any((r["trial"], r["steps"], r["seed"]) == (name, args.steps, seed) for r in rows):
-                rows.append(trial(name, TRIALS[name](BASE(SLIM(COMPACT))), seed, args))
+                rows.append(trial(name, seed, args))
                 save({"rows": rows}, out, json.dumps(rows[-1]))
     print(table(rows))
     print("\n" + details(rows))

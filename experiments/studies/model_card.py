@@ -21,11 +21,7 @@ from fcos_lidar_jax.models.detector import count_parameters
 RESULTS = Path("experiments/results")
 SHIPPED = Path(fcos_lidar_jax.__file__).parent / "weights"
 _BANDS = ("all", "0-20 m", "20-40 m")
-_UNSEEN = {
-    "hdl32e": "with class frequencies of cities and half as many objects as in training",
-    "hdl64e": "with class frequencies of cities and half as many objects as in training",
-    "quickstart": "of the same kind of streets",
-}
+_UNSEEN = "with class frequencies of cities and half as many objects as in training"
 _AXES = "x right, y forward, z up from the sensor, in metres"
 _WEAK_AP, _WEAK_BOXES = 0.05, 10
 """Classes with less AP are listed as hardly detected, if they have at least this many boxes."""
@@ -76,7 +72,8 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield "## Scores\n"
     low, high = record["interval"]["low"], record["interval"]["high"]
     scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
-    yield f"On {record['unseen_frames']} unseen simulated single frames, {_UNSEEN[name]}: {scored}.\n"
+    streets = "of the same kind of streets" if name == "quickstart" else _UNSEEN
+    yield f"On {record['unseen_frames']} unseen simulated single frames, {streets}: {scored}.\n"
 
 
 def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:

@@ -29,7 +29,7 @@ from fcos_lidar_jax.assignment import owners
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
-from fcos_lidar_jax.evaluation.matching import candidate_pairs, greedy, heading_error
+from fcos_lidar_jax.evaluation.matching import Pairs, candidate_pairs, greedy, heading_error
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
 from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.input_pipeline.database import cut_reading
@@ -89,15 +89,6 @@ def owned_cells(frame: Frame) -> np.ndarray:
     return np.bincount(np.asarray(owner)[np.asarray(owner) >= 0], minlength=len(frame.boxes))
 
 
-@dataclasses.dataclass(frozen=True)
-class Match:
-    """One-to-one hits of one frame."""
-
-    truth: Int[np.ndarray, "p"]  # index of the truth of each hit, by decreasing score
-    detection: Int[np.ndarray, "p"]  # index of the detection of each hit
-    centre_error_m: Float[np.ndarray, "p"]  # distance of the centres in the ground plane
-
-
 def match_frame(
     boxes: Float[np.ndarray, "d 9"],
     labels: Int[np.ndarray, "d"],
@@ -108,7 +99,7 @@ def match_frame(
     max_distance_m: float,
     max_heading_error_rad: float = np.inf,
     heading_period_rad: Float[np.ndarray, "k"] | None = None,
-) -> Match:
+) -> Pairs:
     """Match detections, by decreasing score, to the nearest free truth of their class, one to one.
 
     Args:
@@ -125,10 +116,10 @@ def match_frame(
     own_labels = labels[pairs.detection]
     period = np.full(len(own_labels), 2 * np.pi) if heading_period_rad is None else heading_period_rad[own_labels]
     turn = heading_error(boxes[pairs.detection, 6], true_boxes[pairs.truth, 6], period)
-    partner = greedy(pairs.take(turn <= max_heading_error_rad), len(boxes), len(true_boxes))
-    hits = np.flatnonzero(partner >= 0)
-    truth = partner[hits]
-    return Match(truth, order[hits], np.sqrt(((boxes[hits, :2] - true_boxes[truth, :2]) ** 2).sum(axis=1)))
+    pairs = pairs.take(turn <= max_heading_error_rad)
+    partner = greedy(pairs, len(boxes), len(true_boxes))
+    hits = pairs.take(partner[pairs.detection] == pairs.truth)
+    return dataclasses.replace(hits, detection=order[hits.detection])
 
 
 def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:
@@ -165,7 +156,7 @@ def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:
         "detections": len(boxes),
         "far_detections": int(far.sum()),
         "far_fraction": round(float(far.mean()) if len(far) else 0.0, 4),
-        "mean_centre_error_m": round(float(match.centre_error_m[hit].mean()) if hit.any() else 0.0, 4),
+        "mean_centre_error_m": round(float(match.distance_m[hit].mean()) if hit.any() else 0.0, 4),
         "missed": [f"{NUSCENES_CLASSES[frame.labels[i]]} of {cells[i]} cells" for i in missed],
         **({"mean_k": round(last["mean_k"], 2)} if "mean_k" in last else {}),
         "final_loss": round(last["loss/total"], 4),

@@ -19,7 +19,7 @@ def test_matching_is_one_to_one_by_score_and_nearest_first():
     scores, labels = np.array([0.5, 0.9, 0.8]), np.zeros(3, int)
     match = match_frame(boxes, labels, scores, truth, labels[:2], max_distance_m=1.0)
     assert dict(zip(match.detection.tolist(), match.truth.tolist(), strict=True)) == {1: 0, 2: 1}
-    np.testing.assert_allclose(match.centre_error_m, [0.1, 0.8])
+    np.testing.assert_allclose(match.distance_m, [0.1, 0.8])
 
 
 def test_matching_excludes_the_limit_and_respects_classes_and_headings():

@@ -5,7 +5,6 @@ import doctest
 import importlib
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,11 @@ from study_tables import study_tables
 
 from experiments.changes import change
 from experiments.paper import PAPER
-from experiments.paper_tables import __main__ as all_tables
 from experiments.paper_tables import submission as table8
 from experiments.paper_tables import tables
-from experiments.paper_tables.__main__ import TABLES, TablesArgs
+from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.scales import smoke
 from experiments.paper_tables.tables import Args, Row, Table, run_table
-from experiments.script import run_script
 from fcos_lidar_jax.presets import NUSCENES
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -114,29 +111,6 @@ def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, refer
         dataclasses.replace(TABLES["table6"], rows=rows)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different seeds"),
-        (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/cloud.f16.bin there"),
-        (["--scale", "sector", "--steps", "5"], "--steps: only for --scale nuscenes, got --scale sector"),
-        (["--tables", "table9"], f"--tables: got 'table9', expected some of {', '.join(TABLES)}"),
-        (
-            ["--tables", "table1", "table2", "--rows", "base"],
-            "--rows: got ['base'], expected none unless --tables names one table",
-        ),
-        (["--scale", "nuscenes"], "data root: missing, expected the folder of a data set"),
-    ],
-)
-def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_path, options, message):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["tables", *options])
-    with pytest.raises(SystemExit, match="1"):
-        run_script(all_tables.main, TablesArgs, None)
-    assert capsys.readouterr().err == f"tables: error: {message}\n"
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_every_row_has_its_own_configuration_and_its_paper_figures():
     for table in list(TABLES.values())[:6]:
         assert [row.paper for row in table.rows] == list(PAPER["tables"][table.name]["rows"])
@@ -165,11 +139,8 @@ def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(t
 
 def tiny_smoke(cache):
     """The smoke scale with the sensor and the four steps that the tests of training share."""
-    base, frames = (
-        change(optimizer__epochs=1)(tiny_run.CONFIG),
-        tiny_run.STEPS * tiny_run.CONFIG.optimizer.batch_size,
-    )
-    sizes = {"train_frames": frames, "test_frames": 1, "evaluations": 1}
+    base = change(optimizer__epochs=1)(tiny_run.CONFIG)
+    sizes = {"train_frames": tiny_run.STEPS * base.optimizer.batch_size, "test_frames": 1, "evaluations": 1}
     return dataclasses.replace(smoke(cache), base=base, sensor=tiny_run.SENSOR, **sizes)
 
 

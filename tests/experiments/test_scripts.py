@@ -13,6 +13,7 @@ SCRIPTS = sorted(
     if "run_script(" in (text := file.read_text()) or "run_measurement(" in text
 )
 SCRIPTS.remove("experiments.script")
+TABLES = "paper_tables.__main__"
 
 
 def run(script: str, options: list[str], monkeypatch, folder: Path) -> object:
@@ -33,16 +34,23 @@ def test_the_help_of_a_script_names_its_command(script, monkeypatch, tmp_path, c
 
 
 @pytest.mark.parametrize(
-    ("script", "options", "message"),
+    ("command", "message"),
     [
-        ("studies.centerpoint", ["--scale", "nuscenes"], "--scale: got nuscenes, expected smoke or sector"),
-        ("studies.ladder", ["--trials", "base", "magic"], "--trials: got 'magic', expected some of base,"),
-        ("studies.overfit_keyframe", [], "--data: missing, expected the folder that holds nuscenes_scene0061/"),
-        ("studies.shipped_weights", ["--name", "hdl32e", "--export"], "--work: missing, expected the folder"),
-        ("benchmarks.gpu_programs", ["--plugin", "."], "--plugin: .: no nvidia/cuda_nvcc there: run bash .ci/gpu"),
+        (f"{TABLES} --seeds 0 0", "--seeds: got (0, 0), expected different seeds"),
+        (f"{TABLES} --data nowhere", "--data: nowhere: no ten_sweep_cloud/cloud.f16.bin there"),
+        (f"{TABLES} --scale sector --steps 5", "--steps: only for --scale nuscenes, got --scale sector"),
+        (f"{TABLES} --tables table9", "--tables: got 'table9', expected some of table1,"),
+        (f"{TABLES} --rows base", "--rows: got ['base'], expected none unless --tables names one table"),
+        (f"{TABLES} --scale nuscenes", "data root: missing, expected the folder of a data set"),
+        ("studies.centerpoint --scale nuscenes", "--scale: got nuscenes, expected smoke or sector"),
+        ("studies.ladder --trials base magic", "--trials: got 'magic', expected some of base,"),
+        ("studies.overfit_keyframe", "--data: missing, expected the folder that holds nuscenes_scene0061/"),
+        ("studies.shipped_weights --name hdl32e --export", "--work: missing, expected the folder"),
+        ("benchmarks.gpu_programs --plugin .", "--plugin: .: no nvidia/cuda_nvcc there: run bash .ci/gpu"),
     ],
 )
-def test_a_mistake_is_one_line_before_the_work(script, options, message, monkeypatch, tmp_path, capsys):
+def test_a_mistake_is_one_line_before_the_work(command, message, monkeypatch, tmp_path, capsys):
+    script, *options = command.split()
     assert run(f"experiments.{script}", options, monkeypatch, tmp_path) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
