@@ -53,6 +53,8 @@ def test_a_row_that_crashes_or_takes_too_long_costs_only_itself(tmp_path, monkey
     late, crashed, toy = record["rows"].values()
     assert late["failed"] == "not finished after 0 s"
     assert crashed["failed"] == "exit code 3: Check failed"
-    assert toy["single"]["2"]["median_ms"] > 0
+    for times in (toy["single"], toy["multi"]):
+        assert times["1"]["ratio"] == 1
+        assert 0 < times["2"]["median_ms"] <= times["2"]["p99_ms"]
     assert toy["peak_memory_gib"] > 0
     assert {"device", "jax", "git"} <= record.keys()

@@ -49,9 +49,8 @@ def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys)
         ("larger, looked at again", 0, 0),
     ]
     assert all(0 <= row["mAP"] <= 1 and row["step_s"] > 0 for row in rows)
-    look = after.pop("refinement")
+    after.pop("refinement")
     jax.tree.map(np.testing.assert_array_equal, first, after)  # frozen
-    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(look))  # with biases that were zero
     assert '"trial": "larger"' in capsys.readouterr().out
     monkeypatch.setattr(ladder, "trial", None)  # nothing is trained again
     measure(args)
