@@ -203,9 +203,10 @@ def compile_program(program: Program) -> dict[str, Any]:
     mesh = Mesh(topology.devices, ("data",), axis_types=(AxisType.Auto,))
     everywhere, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("data"))
     function, given = _function(program)
-    training: dict[str, Any] = {"in_shardings": (everywhere, rows), "donate_argnums": 0}  # a state and a batch
-    options = training if program.kind == "train" else {"in_shardings": everywhere}
-    jitted = jax.jit(function, out_shardings=everywhere, **options)
+    trains = program.kind == "train"
+    inputs: Any = (everywhere, rows) if trains else everywhere  # Devices share a batch; all have the state.
+    donated = (0,) if trains else ()
+    jitted = jax.jit(function, in_shardings=inputs, out_shardings=everywhere, donate_argnums=donated)
     began = time.monotonic()
     lowered = jitted.lower(*given)
     compiled = lowered.compile()

@@ -73,16 +73,10 @@ def kept_by_rounds(
     return found
 
 
-def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[str, dict[str, float]]]:
+def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, Any]:
     """Average :func:`kept_by_rounds` over clouds."""
     found = [kept_by_rounds(cloud, sensor) for cloud in clouds]
-    return {
-        name: {
-            what: {r: round(float(np.mean([f[name][what][r] for f in found])), 2) for r in map(str, ROUNDS)}
-            for what in ("percent", "current")
-        }
-        for name in ("prioritized", "not prioritized")
-    }
+    return jax.tree.map(lambda *numbers: round(float(np.mean(numbers)), 2), *found)
 
 
 def mrv_times(
