@@ -49,14 +49,14 @@ def random_frames(seed: int, number: int = 6):
 def test_a_span_holds_the_boxes_of_its_distances(near, far):
     found, frames = random_frames(0)
     chosen, rest = within(found, frames, near, far)
+
+    def inside(boxes):
+        return np.array([near <= math.hypot(x, y) < far for x, y in boxes[:, :2].tolist()])
+
     for before, after, d, e in zip(frames, rest, found, chosen, strict=True):
-        distances = [math.sqrt(float(x) ** 2 + float(y) ** 2) for x, y in before.boxes[:, :2]]
-        kept = [i for i, distance in enumerate(distances) if near <= distance < far]
         for name in ("boxes", "labels", "num_points"):
-            np.testing.assert_array_equal(getattr(after, name), getattr(before, name)[kept])
-        for i, box in enumerate(d.boxes):
-            inside = near <= math.sqrt(float(box[0]) ** 2 + float(box[1]) ** 2) < far
-            assert e.valid[i] == (d.valid[i] and inside)
+            np.testing.assert_array_equal(getattr(after, name), getattr(before, name)[inside(before.boxes)])
+        np.testing.assert_array_equal(e.valid, d.valid & inside(d.boxes))
 
 
 def test_every_third_training_street_has_matt_cars_like_the_tests():
