@@ -14,7 +14,7 @@ too, which the paper does not have. The verdict follows from the 95 % interval o
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from experiments.paper import PAPER
 from experiments.paper_tables.cells import Cell, changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
 from experiments.paper_tables.tables import SCORES
-from experiments.script import run_script
+from experiments.script import markdown_table, run_script
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
 from fcos_lidar_jax.files import atomic_write, read_json
 
@@ -176,28 +176,26 @@ def gains_of(
     return gains
 
 
-def figure_lines() -> Iterator[str]:
-    """Yield a line of Markdown for each claim that needs no training."""
+def figure_rows() -> Iterator[list[str]]:
+    """Yield the cells of each claim that needs no training."""
     for figure in FIGURES:
         ours = figure.value(read_json(RESULTS / f"{figure.file}.json", dict[str, Any]))
         said = verdict_of_figure(figure, ours)
         paper = f"more than {figure.paper:g}" if figure.above else f"{figure.paper:.3g}"
         source = f"[{figure.file}](results/{figure.file}.json)"
-        yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} |"
+        yield [figure.claim, paper, f"{ours:.3g}", source, said]
 
 
-def claim_lines(score: str) -> Iterator[str]:
-    """Yield a line of Markdown for each claim about a score."""
+def claim_rows(score: str) -> Iterator[list[str]]:
+    """Yield the cells of each claim about a score."""
     scale = quarter(Path("unused"))
     cells = read_cells(RESULTS / "tables" / scale.name, scale)
     for claim in CLAIMS:
         table, *rows = claim.paper
         theirs, reference = (PAPER["tables"][table]["rows"][row][score] for row in rows)
-        paper, columns = round(theirs - reference, 2), []
-        for network in NETWORKS.values():
-            gains = gains_of(claim, network, scale, cells, score)
-            columns.append(_said(gains, paper) if gains else "not trained")
-        yield f"| {claim.text} | {paper:+.2f} | {' | '.join(columns)} |"
+        paper = round(theirs - reference, 2)
+        gains = [gains_of(claim, network, scale, cells, score) for network in NETWORKS.values()]
+        yield [claim.text, f"{paper:+.2f}", *(_said(own, paper) if own else "not trained" for own in gains)]
 
 
 def _said(gains: list[float], paper: float) -> str:
@@ -207,17 +205,12 @@ def _said(gains: list[float], paper: float) -> str:
     return f"{ours} {seeds}{': '.join(filter(None, verdict(gains, paper)))}"
 
 
-def _table(columns: str, lines: Iterable[str]) -> str:
-    return "\n".join((f"| {columns} |", "|---" * (columns.count("|") + 1) + "|", *lines))
-
-
 def as_markdown() -> str:
     """Format the whole ledger."""
-    parts = [_table("without training | paper | here | from | verdict", figure_lines())]
+    tables = [markdown_table(("without training", "paper", "here", "from", "verdict"), figure_rows())]
     for score in SCORES:
-        columns = f"gain in points of {score} | paper | {' | '.join(NETWORKS)}"
-        parts.append(_table(columns, claim_lines(score)))
-    return "\n\n".join([*parts, _OUR_NDS]) + "\n"
+        tables.append(markdown_table((f"gain in points of {score}", "paper", *NETWORKS), claim_rows(score)))
+    return "\n\n".join([*map("\n".join, tables), _OUR_NDS]) + "\n"
 
 
 def with_ledger(document: str, ledger: str) -> str:

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -49,6 +49,12 @@ def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> N
     print(text or written, flush=True)
     file = out or Path("outputs", f"{Path(sys.argv[0]).stem}.json")
     atomic_write(file, written + "\n")
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Format a table in Markdown, line by line."""
+    first, *lines = (f"| {' | '.join(cells)} |" for cells in (header, *rows))
+    return [first, "|---" * len(header) + "|", *lines]
 
 
 def compact_json(value: Any, depth: int = 2) -> str:

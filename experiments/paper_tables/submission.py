@@ -12,6 +12,7 @@ from experiments.paper import PAPER
 from experiments.paper_tables.cells import changes_of, read_cells, run_name
 from experiments.paper_tables.scales import NuScenesLayout, write_submission
 from experiments.paper_tables.tables import Args, Row, Table, make_scale
+from experiments.script import markdown_table
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.files import read_json
@@ -62,8 +63,8 @@ def figures(args: Args) -> dict[str, Any]:
     """Quote the paper's rows and write the results file."""
     quoted = PAPER["tables"]["table8"]["rows"]
     lines = ["Test set, paper (quoted there from the systems' own papers):", ""]
-    lines += ["| method | mAP | NDS |", "|---|---|---|"]
-    lines += [f"| {name} | {row['mAP']} | {row['NDS']} |" for name, row in quoted.items()]
+    rows = [(name, str(row["mAP"]), str(row["NDS"])) for name, row in quoted.items()]
+    lines += markdown_table(("method", "mAP", "NDS"), rows)
     return {"lines": [*lines, "", *([] if args.only_figures else submission(args))]}
 
 

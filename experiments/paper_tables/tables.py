@@ -16,7 +16,7 @@ from experiments.paper import PAPER
 from experiments.paper_tables.cells import Cell
 from experiments.paper_tables.grid import run_cells
 from experiments.paper_tables.scales import NuScenesLayout, Scale, Simulated, quarter, smoke
-from experiments.script import compact_json
+from experiments.script import compact_json, markdown_table
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
@@ -218,7 +218,7 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
         header += [f"{s}, paper", "difference, paper"] if of_paper else []
     note = f"; {_training_text(record['trained_on'])}" if trained else ""
     lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}{note}.", ""]
-    lines += ["| " + " | ".join([*header, *extra]) + " |", "|---" * (len(header) + len(extra)) + "|"]
+    rows = []
     for row in record["rows"]:
         cells, itself = [row["label"]], row["label"] == row["reference"]
         for s in SCORES:
@@ -228,7 +228,8 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
                 gain = row["paper_difference"].get(s)
                 cells += [_number(row["paper"].get(s)), "-" if itself else _number(gain, sign=True)]
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
-        lines.append("| " + " | ".join(cells) + " |")
+        rows.append(cells)
+    lines += markdown_table([*header, *extra], rows)
     drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
     references = " or ".join(dict.fromkeys(f'"{row["reference"]}"' for row in record["rows"]))
     lines += ["", f"Differences are to {references}{drawn}.", *_notes(record), ""]

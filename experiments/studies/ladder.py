@@ -33,7 +33,7 @@ from experiments.cached import CachedFrames
 from experiments.changes import AHEAD, BONNET_M, LARGER, LONE_LOOK, QUARTER_LOOK, SLIM, Change, change
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
-from experiments.script import Options, run_script, save
+from experiments.script import Options, markdown_table, run_script, save
 from experiments.second_look import USES, look_again, look_config
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
@@ -181,11 +181,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     >>> print(table(rows).splitlines()[-1])
     | wide | 9 | 0.2000, 0.2100 | 0.2050 | +0.1000 [+0.1000, +0.1000] | 1.95 |  | 0.30 | 7 |
     """
-    lines = [
-        "| trial | steps | mAP by seed | mean | minus base, 95 % | times base | minus CenterPoint, 95 % "
-        "| s per step | parameters |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    header = ["trial", "steps", "mAP by seed", "mean", "minus base, 95 %", "times base", "minus CenterPoint, 95 %"]
+    lines = []
     scores: dict[tuple[int, str], dict[int, float]] = {}
     for row in rows:
         scores.setdefault((row["steps"], row["trial"]), {})[row["seed"]] = row["mAP"]
@@ -197,12 +194,9 @@ def table(rows: list[dict[str, Any]]) -> str:
         if seeds:
             ratio = f"{sum(own[s] for s in seeds) / max(sum(base[s] for s in seeds), 1e-9):.2f}"
         each, mean = ", ".join(f"{own[s]:.4f}" for s in sorted(own)), statistics.mean(own.values())
-        lines.append(
-            f"| {name} | {steps:,} | {each} | {mean:.4f} "
-            f"| {_difference(own, base)} | {ratio} | {_difference(own, peer)} | {step_s:.2f} "
-            f"| {all_of[0]['parameters']:,} |"
-        )
-    return "\n".join(lines)
+        cells = [name, f"{steps:,}", each, f"{mean:.4f}", _difference(own, base), ratio, _difference(own, peer)]
+        lines.append([*cells, f"{step_s:.2f}", f"{all_of[0]['parameters']:,}"])
+    return "\n".join(markdown_table([*header, "s per step", "parameters"], lines))
 
 
 def _difference(own: dict[int, float], other: dict[int, float]) -> str:
@@ -221,14 +215,14 @@ def details(rows: list[dict[str, Any]]) -> str:
     """
     rows = [row for row in rows if "by_distance" in row]
     classes = [c for c in NUSCENES_CLASSES if any(c in row["AP"] for row in rows)]
-    head = " | ".join(name.replace("_", " ") for name in classes)
-    lines = [f"| trial | steps | AP at 0.5 / 1 / 2 / 4 m | {head} |", "|---|---|---|" + "---|" * len(classes)]
+    header = ["trial", "steps", "AP at 0.5 / 1 / 2 / 4 m", *(name.replace("_", " ") for name in classes)]
+    lines = []
     for steps, name in sorted({(row["steps"], row["trial"]) for row in rows}):
         own = [row for row in rows if (row["steps"], row["trial"]) == (steps, name)]
         at = " / ".join(f"{statistics.mean(row['by_distance'][d] for row in own):.3f}" for d in DISTANCES_M)
-        aps = " | ".join(f"{statistics.mean(row['AP'].get(c, 0.0) for row in own):.3f}" for c in classes)
-        lines.append(f"| {name} | {steps:,} | {at} | {aps} |")
-    return "\n".join(lines)
+        aps = (statistics.mean(row["AP"].get(c, 0.0) for row in own) for c in classes)
+        lines.append([name, f"{steps:,}", at, *(f"{ap:.3f}" for ap in aps)])
+    return "\n".join(markdown_table(header, lines))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import fcos_lidar_jax
-from experiments.script import run_script
+from experiments.script import markdown_table, run_script
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.inference import load_trained
@@ -130,12 +130,12 @@ def _part(name: str, part: Mapping[str, Any]) -> Iterator[str]:
     number = f"{part['keyframes']} keyframe{'s' if part['keyframes'] > 1 else ''}"
     yield f"\n### {source[0].upper()}{source[1:]}: {number}\n"
     yield f"{', '.join(scores)}.\n"
-    yield f"| class | {' | '.join(_BANDS)} |\n|---|{'---|' * len(_BANDS)}"
-    aps, truths = part["all"]["AP"], part["all"]["truths"]
+    aps, truths, rows = part["all"]["AP"], part["all"]["truths"], []
     for label in aps:
         bands = [part[band] for band in _BANDS]
         shown = [f"{b['AP'][label]:.3f} ({b['truths'][label]})" if label in b["AP"] else "-" for b in bands]
-        yield f"| {label.replace('_', ' ')} | {' | '.join(shown)} |"
+        rows.append([label.replace("_", " "), *shown])
+    yield from markdown_table(["class", *_BANDS], rows)
     often = [label for label, boxes in truths.items() if boxes >= _WEAK_BOXES]
     if weak := [label.replace("_", " ") for label in often if aps[label] < _WEAK_AP]:
         yield f"\nHardly detected (AP below {_WEAK_AP:g} with at least {_WEAK_BOXES} boxes): {', '.join(weak)}."

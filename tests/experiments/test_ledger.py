@@ -12,7 +12,7 @@ from experiments.ledger import (
     README,
     RESULTS,
     as_markdown,
-    claim_lines,
+    claim_rows,
     gains_of,
     verdict,
     with_ledger,
@@ -98,5 +98,4 @@ def test_gains_are_of_the_same_network():
 
 
 def test_gains_of_the_paper_are_those_of_its_tables():
-    lines = [line.split(" | ")[:2] for line in claim_lines("mAP")]
-    assert [float(paper) for _, paper in lines] == [0.28, 2.06, 1.88, 3.66, 3.94, 2.79, 0.64]
+    assert [float(paper) for _, paper, *_ in claim_rows("mAP")] == [0.28, 2.06, 1.88, 3.66, 3.94, 2.79, 0.64]
