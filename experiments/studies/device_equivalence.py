@@ -129,7 +129,7 @@ def _mapped_step(step: Any, start: TrainState, mesh: Mesh) -> tuple[Any, ...]:
     return jax.tree.map(lambda leaf: leaf[0], _outcome(*pmap_step(step, mesh)(state, batch)))
 
 
-def work(folder: Path, sizes: list[int], processes: int, process: int, port: int, dtype: str) -> None:
+def work(folder: Path, sizes: list[int], processes: int, port: int, dtype: str, process: int) -> None:
     """Measure on all meshes, as one of several processes."""
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_num_cpu_devices", max(sizes) // processes)
@@ -147,9 +147,7 @@ def launch(folder: Path, sizes: list[int], processes: int, dtype: str) -> None:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        started = [pool.submit(work, folder, sizes, processes, i, port, dtype) for i in range(processes)]
-        for process in started:
-            process.result()
+        list(pool.map(functools.partial(work, folder, sizes, processes, port, dtype), range(processes)))
 
 
 def _difference(one: dict[str, np.ndarray], many: dict[str, np.ndarray], part: str) -> float:

@@ -58,6 +58,7 @@ TEST = range(3, 11)  # Keyframes of scene-0523.
 TRAIN = [i for i in range(40) if i not in TEST]
 _OVERLAP = 0.1  # IoU on the ground from which two boxes stand for one object.
 _REPEATS = 300  # Bootstrap samples of an interval.
+_overlaps = jax.jit(lambda boxes: rotated_iou_bev(boxes[:, None], boxes[None]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,11 +144,6 @@ def overlapping_share(found: Sequence[Detections]) -> float:
         shown += int(kept.sum())
         overlapping += int((pair & (iou > _OVERLAP)).any(axis=1).sum())
     return round(overlapping / max(shown, 1), 4)
-
-
-@jax.jit
-def _overlaps(boxes: jax.Array) -> jax.Array:
-    return rotated_iou_bev(boxes[:, None], boxes[None])
 
 
 def fine_tuning(args: Args) -> Iterator[dict[str, Any]]:

@@ -25,21 +25,15 @@ def test_the_search_for_boxes_resumes_and_the_detector_stays(tmp_path):
         first = TrainedDetector(build_detector(config, SENSOR), weights(config))
         args = {"samples": 4, "updates": 3, "folder": tmp_path}
         before = look_again(first, config, FRAMES, seed=1, **args).variables["params"]
-        (tmp_path / "done.json").write_text(
-            json.dumps(json.loads((tmp_path / "done.json").read_text()) | {"done": 2})
-        )
+        done = tmp_path / "done.json"
+        done.write_text(json.dumps(json.loads(done.read_text()) | {"done": 2}))
         for file in tmp_path.glob("*.npy"):
             np.lib.format.open_memmap(file, "r+")[2:] = 0
         after = look_again(first, config, FRAMES, seed=1, **args).variables["params"]
         assert bits(after) == bits(before)
         assert bits({**after, "refinement": ()}) == bits({**first.variables["params"], "refinement": ()})
-        look = after["refinement"]
-        assert all(
-            (old != new).any()
-            for old, new in zip(
-                *map(jax.tree.leaves, (weights(config)["params"]["refinement"], look)), strict=True
-            )
-        )
+        drawn = weights(config)["params"]["refinement"]
+        assert jax.tree.all(jax.tree.map(lambda old, new: bool((old != new).any()), drawn, after["refinement"]))
         with pytest.raises(ValueError, match=r"found the boxes of another training, expected another folder"):
             look_again(first, config, FRAMES, seed=2, **args)
 
