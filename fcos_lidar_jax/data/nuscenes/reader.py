@@ -300,10 +300,9 @@ class NuScenes:
     def _read(self, row: int) -> Sweep:
         path = self._expect_file(row)
         size = path.stat().st_size
-        if size == 0 or size % (4 * _COLUMNS) or size > 4 * _COLUMNS * MAX_POINTS:
-            found = "an empty file" if size == 0 else f"{size} bytes"
-            expected = f"a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_POINTS} points"
-            raise ValueError(f"{path}: got {found}, expected {expected}")
+        if size % (4 * _COLUMNS) or not 0 < size <= 4 * _COLUMNS * MAX_POINTS:
+            expected = f"a multiple of {4 * _COLUMNS} (float32 x 5), 1 to {MAX_POINTS} points"
+            raise ValueError(f"{path}: got {size} bytes, expected {expected}")
         points = np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
         return Sweep(points, self._sensor_to_global(row), int(self.index.sweep_time_us[row]), str(path))
 
