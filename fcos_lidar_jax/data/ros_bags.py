@@ -118,9 +118,6 @@ class _Bag(contextlib.AbstractContextManager):
         import_extra("rosbags", "ros", f"{path}: ")
         from rosbags import rosbag1, rosbag2
 
-        files = [path, *path.iterdir()] if path.is_dir() else [path]
-        if odd := [file for file in files if file.suffix == ".db3" and set("%?#") & set(str(file))]:
-            raise ValueError(f"{printable(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")
         with _refusing(str(path)), contextlib.ExitStack() as opened:
             self.path, parts = path, _files(path)
             self._is_ros1 = parts[0].suffix == ".bag"

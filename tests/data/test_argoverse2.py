@@ -172,7 +172,7 @@ def boxes(**changes):
 ONE = np.array([1, 0, 0, 0.0])
 BAD = {
     "no poses": (lambda log: (log / P).unlink(), P, "cannot be read: No such file or directory"),
-    "empty": (rewrite(P, lambda _: b""), P, "empty file"),
+    "empty": (rewrite(P, lambda _: b""), P, "got 0 bytes, expected 1 to"),
     "cut": (rewrite(A, lambda content: content[:-40]), A, "not a readable .feather file: "),
     "no column": (change(P, qz=None), P, 'Field "qz" does not exist'),
     "text": (change(S, x=["one"] * 4), S, "x: got string, expected numbers"),
@@ -182,7 +182,7 @@ BAD = {
     "no size": (boxes(box=[9, 0, 0, 4, 0, 1.5, 0]), A, "row 1: w: got 0, expected a size above 0 m"),
     "laser": (change(S, laser_number=np.array([0, 1, 64, 2], np.uint8)), S, "laser number: got 64 in row 2"),
     "box without a pose": (boxes(time_ns=5), P, "no pose at 5 ns, expected one for every"),
-    "name": (lambda log: (log / S).rename(log / FIRST), FIRST, "got 'first', expected a name of whole nanosec"),
+    "name": (lambda log: (log / S).rename(log / FIRST), FIRST, "expected a name of whole nanosec"),
 }
 
 

@@ -301,12 +301,6 @@ def test_clouds_outside_the_poses_are_skipped_with_a_note(tmp_path):
         list(ros_bag_drive(bag, TINY, odometry="/odom").sweeps)
 
 
-@pytest.mark.parametrize("name", ["a%20b.db3", "a?mode=rw.db3", "a#b.db3"])
-def test_file_names_that_sqlite_misreads_are_refused(tmp_path, name):
-    with refused(f"{name}: %, ? or # in the name"):
-        ros_bag_drive(tmp_path / name, TINY)
-
-
 def moving(*names):
     return lambda make: (
         ("/tf", make.transform(t, parent, child, *motion(seconds)))
