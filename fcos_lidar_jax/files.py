@@ -154,10 +154,9 @@ def check_writable(path: Path) -> None:
     """Reject a path at which :func:`atomic_write` would fail, as far as this is known without writing."""
     _check_kind(path)
     folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
-    if not folder.is_dir():
-        raise NotADirectoryError(f"{folder}: found a file, expected a folder to write to")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{folder}: found a folder without write permission, expected a folder to write to")
+    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        found = "a folder without write permission" if folder.is_dir() else "a file"
+        raise PermissionError(f"{folder}: found {found}, expected a folder to write to")
 
 
 def _check_kind(path: Path) -> None:
@@ -197,11 +196,9 @@ def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
     Raises:
         OSError: naming the file: another process writes to it, or a line cannot be written.
     """
-    with path.open("ab", buffering=0) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(f"{path}: in use: another process, expected no other process") from None
+    with file_lock(path) as held, path.open("ab", buffering=0) as file:
+        if not held:
+            raise BlockingIOError(f"{path}: in use: another process, expected no other process")
         file.truncate(0)
         size = 0  # Bytes of whole lines.
 
