@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-_MAX_TEXT = 1000  # of an exception, in characters
+from fcos_lidar_jax.fields import printable
 
 
 def atomic_write(path: str | Path, content: str | bytes | Callable[[Path], object]) -> None:
@@ -101,7 +101,8 @@ def refusing(
     try:
         yield
     except caught as error:
-        text = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())[:_MAX_TEXT]
+        text = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
+        text = printable(text or type(error).__name__, 1000)
         raise kind(f"{where}{': ' if where else ''}{text}{more}") from None
 
 
@@ -250,7 +251,7 @@ def _explain(message: str, content: Any) -> str:
         return message
     for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", place):
         content = content[key or int(index)]
-    got = text if len(text := repr(content)) <= 60 else f"{text[:57]}..."
+    got = printable(repr(content), 57)
     expected = re.fullmatch(r"Expected (.+?)(, got .*)?", problem.replace("`", ""))
     return f"{place or '$'}: {f'got {got}, expected {expected[1]}' if expected else f'{problem}, got {got}'}"
 
