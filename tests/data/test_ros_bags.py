@@ -10,7 +10,7 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, TINY
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, TINY
 
 START_NS = 1_700_000_000_123_456_789
 POINTS = structured(np.random.default_rng(0).uniform(1, 20, (12, 4)).astype(np.float32))
@@ -320,50 +320,33 @@ def standing(*stamps_ns, **last):
     return content
 
 
-WRONG_DRIVES = {  # source of the poses, their messages, fragments of the message
-    "another topic of odometry": (
-        *("/odm", standing(0), "odometry: got '/odm', expected"),
-        "among: /odom (nav_msgs/msg/Odometry, 1 messages)",
-    ),
+TWO_PARENTS = moving(("odom", "base_link"), ("map", "base_link"))
+WRONG_DRIVES = {  # source of the poses, their messages, the message
+    "another topic of odometry": ("/odm", standing(0), "odometry: got '/odm', expected a topic of Odometry or Po"),
     "a gap": ("/odom", standing(0, 6 * 10**8), "/points: message 0: /odom: at 1700000000.173456 s: a gap in the"),
-    "time going back": (
-        *("/odom", standing(5000, 4000), "/odom: message 1: time: got 1700000000.12346 s after"),
-        "1700000000.123461 s, expected a later one",
-    ),
-    "no unit quaternion": (
-        *("/odom", standing(0, 4000, turn=(0, 0, 0, 0))),
-        "/odom: message 1: rotation: got [0.0, 0.0, 0.0, 0.0], expected a unit quaternion",
-    ),
-    "other frames": (
-        *("/odom", standing(0, 4000, child="imu")),
-        "/odom: message 1: child_frame_id: got 'imu', expected 'base_link' as before",
-    ),
+    "time going back": ("/odom", standing(5000, 4000), "/odom: message 1: time: got 1700000000.12346 s after 170"),
+    "no rotation": ("/odom", standing(0, 4000, turn=(0, 0, 0, 0)), "/odom: message 1: rotation: got [0.0, 0.0, 0"),
+    "other frames": ("/odom", standing(0, 4000, child="imu"), "/odom: message 1: child_frame_id: got 'imu', expe"),
     "no transform": (
-        *("/odom", odometry_of("chassis"), "/points: message 0: no transform from 'lidar' to 'chassis', expected"),
+        *("/odom", odometry_of("chassis")),
+        "/points: message 0: no transform from 'lidar' to 'chassis', expected one in /tf_static or /tf, which have "
         "transforms of: imu, lidar, mount",
     ),
-    "nothing that moves": (
-        "tf",
-        standing(),
-        "got the frames lidar -> mount -> base_link, expected one that moves",
-    ),
+    "nothing that moves": ("tf", standing(), "got the frames lidar -> mount -> base_link, expected one that move"),
     "a gap in transforms": (
         *("tf", lambda make: np.delete(list(moving(("odom", "base_link"))(make)), range(2, 8), axis=0)),
         "/points: message 1: tf of base_link in odom: at 1700000000.323456 s: a gap in the poses",
     ),
-    "two parents": (
-        *("tf", moving(("odom", "base_link"), ("map", "base_link"))),
-        "a: tf: frame 'base_link' has 2 parents, expected a tree",
-    ),
+    "two parents": ("tf", TWO_PARENTS, "a: tf: frame 'base_link' has 2 parents, expected a tree"),
     "a circle": ("tf", moving(("lidar", "base_link")), "a: tf: frame 'base_link' is its own ancestor, expected a"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG_DRIVES)
 def test_unusable_poses_are_refused(tmp_path, case):
-    source, poses, *fragments = WRONG_DRIVES[case]
+    source, poses, message = WRONG_DRIVES[case]
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, poses))
-    with refused(f"{bag}: ", *fragments):
+    with refused(message, f"{bag}: "):
         list(ros_bag_drive(bag, TINY, odometry=source).sweeps)
 
 
@@ -393,10 +376,7 @@ def field(offset, datatype, count):
 
 
 WRONG_CLOUDS = {
-    "too short": (
-        {"data": np.zeros(191, np.uint8)},
-        "data: got 191 bytes, and row_step 192, expected 1 rows of 12",
-    ),
+    "too short": ({"data": np.zeros(191, np.uint8)}, "data: got 191 bytes, and row_step 192, expected 1 rows of"),
     "huge": ({"width": 2**32 - 1, "height": 2**32 - 1}, "x 4294967295 points, expected at most 10000000"),
     "wide rows": ({"row_step": 2**32 - 1, "height": 2}, "data: got 192 bytes, and row_step 4294967295"),
     "narrow rows": ({"row_step": 100, "width": 7, "height": 2}, "data: got 192 bytes, and row_step 100"),
@@ -420,14 +400,6 @@ def test_damaged_clouds_are_refused(tmp_path, case):
 )
 def test_messages_without_points_are_empty_sweeps(tmp_path, changed):
     assert one_sweep(tmp_path, POINTS[:0], **changed).points.shape == (0, 5)
-
-
-def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):
-    bag = write_recording(tmp_path / "a", "sqlite", one_cloud)
-    with refused("/p: message 0: got 12 x 1 points, expected at most 11"):
-        list(ros_bag_drive(bag, NUSCENES_HDL32E, max_points=11).sweeps)
-    with refused("/p: message 0: no laser number in it"):
-        list(ros_bag_drive(bag, ARGOVERSE2).sweeps)
 
 
 @pytest.mark.parametrize(
