@@ -329,8 +329,8 @@ WRONG_DRIVES = {  # source of the poses, their messages, the message
     "other frames": ("/odom", standing(0, 4000, child="imu"), "/odom: message 1: child_frame_id: got 'imu', expe"),
     "no transform": (
         *("/odom", odometry_of("chassis")),
-        "/points: message 0: no transform from 'lidar' to 'chassis', expected one in /tf_static or /tf, which have "
-        "transforms of: imu, lidar, mount",
+        "/points: message 0: no transform from 'lidar' to 'chassis', expected one in /tf_static or /tf, which "
+        "have transforms of: imu, lidar, mount",
     ),
     "nothing that moves": ("tf", standing(), "got the frames lidar -> mount -> base_link, expected one that move"),
     "a gap in transforms": (
