@@ -18,8 +18,17 @@ NO_TURN = (0, 0, 0, 1)
 VELOCITY, YAW_RATE = np.array([8.0, -3.0, 0.5]), 0.7
 
 
-def one_cloud(make):
-    return [("/p", make.cloud(1, POINTS))]
+def clouds(*stamps_ns, texts=0):
+    """Clouds after messages of another topic."""
+
+    def content(make):
+        yield from [("/chatter", make.text("hello"))] * texts
+        yield from (("/p", make.cloud(stamp, POINTS)) for stamp in stamps_ns)
+
+    return content
+
+
+one_cloud = clouds(1)
 
 
 def one_sweep(folder, points, **changed):
@@ -112,15 +121,8 @@ def test_folders_of_files_are_read_in_the_order_of_recording(tmp_path, form):
     folder = tmp_path / "files"
     folder.mkdir()
     for name, before in (("a_9", 0), ("a_10", 3)):
-        bag = write_recording(
-            tmp_path / name,
-            form,
-            lambda make, before=before: [
-                *[("/chatter", make.text("hello"))] * before,
-                *(("/p", make.cloud((before + i) * 1000, POINTS)) for i in range(3)),
-            ],
-        )
-        file = data_file(bag)
+        stamps_ns = [(before + i) * 1000 for i in range(3)]
+        file = data_file(write_recording(tmp_path / name, form, clouds(*stamps_ns, texts=before)))
         file.rename(folder / f"{name}{file.suffix}")
     assert is_ros_bag(folder)
     sweeps = list(ros_bag_drive(folder, TINY).sweeps)
@@ -132,28 +134,21 @@ def test_folders_of_files_are_read_in_the_order_of_recording(tmp_path, form):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_without_odometry_sweeps_have_times_but_no_poses(tmp_path, form):
-    bag = write_recording(
-        tmp_path / "a",
-        form,
-        lambda make: [
-            ("/chatter", make.text("hello")),
-            *(("/p", make.cloud(START_NS + i * 10**8, POINTS)) for i in range(3)),
-        ],
-    )
+    stamps_ns = [START_NS + i * 10**8 for i in range(3)]
+    bag = write_recording(tmp_path / "a", form, clouds(*stamps_ns, texts=1))
     assert is_ros_bag(bag)
     drive = ros_bag_drive(bag, TINY)
     assert (drive.posed, drive.timed) == (False, True)
     sweeps = list(drive.sweeps)
     assert [sweep.name for sweep in sweeps] == [f"{bag}: /p: message {i}" for i in range(3)]
-    assert [sweep.time_us for sweep in sweeps] == [START_NS // 1000 + i * 10**5 for i in range(3)]
+    assert [sweep.time_us for sweep in sweeps] == [stamp // 1000 for stamp in stamps_ns]
 
 
 def test_clouds_of_several_sensors_on_one_topic_are_told_once(tmp_path, capsys):
-    def clouds(make):
-        for number in range(6):
-            yield "/points", make.cloud(START_NS + number * 10**8, POINTS, ("lidar", "/lidar", "rear")[number % 3])
-
-    bag = write_recording(tmp_path / "a", "mcap", clouds)
+    frames = ["lidar", "/lidar", "rear"] * 2
+    bag = write_recording(
+        tmp_path / "a", "mcap", lambda make: [("/points", make.cloud(START_NS, POINTS, frame)) for frame in frames]
+    )
     assert len(list(ros_bag_drive(bag, TINY).sweeps)) == 6
     told = f"note: {bag}: /points: message 2: frame_id 'rear' after 'lidar': clouds of several sensors?\n"
     assert capsys.readouterr().err == told
