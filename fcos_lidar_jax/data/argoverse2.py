@@ -56,10 +56,6 @@ class Argoverse2Frames(FrameSet):
     classes of the detection benchmark are dropped. Velocities are not annotated: they follow from the tracks in
     the city frame, by the rule of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, and are given along the
     ego vehicle's axes.
-
-    Raises:
-        ValueError: at construction or on reading a frame, with the file, the row, the field, the found and the
-            expected value.
     """
 
     classes = ARGOVERSE2_CLASSES

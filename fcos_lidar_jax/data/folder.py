@@ -49,10 +49,6 @@ class FolderFrames(FrameSet):
         sensor: replaces ``sensor.json``.
         split: take the frames and their order from a split; default: all frames, sorted.
         splits: JSON file with the splits; default: ``splits.json``.
-
-    Raises:
-        ValueError: at construction or on reading a frame, with the file, the field, the found and the expected
-            value.
     """
 
     def __init__(

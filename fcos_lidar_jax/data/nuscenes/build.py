@@ -105,8 +105,8 @@ def _sweeps(tables: _Tables, samples: dict[str, int]) -> Columns:
     """The LiDAR's sweeps with their poses, each linked to the sweep before it."""
     sensors, sensor_numbers = tables.read(kinds.SensorRow)
     mounts, mount_numbers = tables.read(kinds.CalibratedSensor)
-    channels = [sensors[tables.find(sensor_numbers, mount, "sensor_token")].channel for mount in mounts]
-    mounts = [mount for mount, channel in zip(mounts, channels, strict=True) if channel == CHANNEL]
+    sensor_of = tables.find_all(sensor_numbers, mounts, "sensor_token", np.int32)
+    mounts = [mount for mount, i in zip(mounts, sensor_of, strict=True) if sensors[i].channel == CHANNEL]
     lidars = {mount.token: i for i, mount in enumerate(mounts)}
     rows: list[kinds.SampleData] = []
     for piece in tables.pieces(kinds.SampleData):
