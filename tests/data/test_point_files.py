@@ -326,9 +326,9 @@ def packed_pcd(packed, plain_size=16, number=1):
 
 
 def wrapping_pcd():
-    """A point of 3,224,000,012 bytes, whose size overflows in 32 bits, and only a few of its bytes."""
-    names = " ".join(f"f{i}" for i in range(403))
-    sizes, kinds, counts = "8 " * 403, "F " * 403, "1000000 " * 403
+    """A point of 2**32 + 12 bytes, whose size is 12 where it wraps in 32 bits, and only a few of its bytes."""
+    names = " ".join(f"f{i}" for i in range(2**13))
+    sizes, kinds, counts = "8 " * 2**13, "F " * 2**13, f"{2**16} " * 2**13
     header = pcd_header("binary", 1, f"x y z {names}", f"F F F {kinds}", f"4 4 4 {sizes}", f"1 1 1 {counts}")
     return header + bytes(4096)
 
@@ -383,7 +383,7 @@ BAD = {
     "count.pcd": (pcd_header("ascii", 1, counts="1 1 1 0") + b"1 2 3\n", "COUNT and POINTS: got 1 1 1 0 and 1"),
     "double_z.pcd": (pcd_header("ascii", 1, counts="1 1 2 1") + b"1 2 3 3 4\n", "expected one value per column"),
     "negative.pcd": (pcd_header("binary", -1) + bytes(64), "expected one value per column"),
-    "wrapping.pcd": (wrapping_pcd(), "POINTS: got 1 points of 3224000012 bytes, expected"),
+    "wrapping.pcd": (wrapping_pcd(), "POINTS: got 1 points of 4294967308 bytes, expec"),
     "wrapping_64.pcd": (pcd_header("binary", 2**60) + bytes(4096), f"POINTS: got {2**60} points of 16 bytes"),
     "expanding.pcd": (packed_pcd(b"\x00aa", 2**26, 2**22), "DATA: got 3 compressed bytes of 67108864"),
     "no_number.pcd": (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nDATA ascii\n1 2 3\n", "damaged header: 'WIDTH'"),
