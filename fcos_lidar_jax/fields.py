@@ -53,11 +53,16 @@ Between = Annotated[float, Bounds(0, 1, above=True, below=True)]  # 0 and 1
 Range = Annotated[tuple[float, float], Bounds(0.0, above=True, ascending=True)]
 
 
+def printable(text: str, longest: int = 500) -> str:
+    """A text of a file for one line of a message: at most ``longest`` printable characters."""
+    text = text if text.isprintable() else repr(text)
+    return text if len(text) <= longest else text[:longest] + "..."
+
+
 def check(condition: bool, field: str, got: object, expected: str) -> None:
     """Raise a ValueError with the field, the found and the expected value unless a condition holds."""
     if not condition:
-        text = repr(got)
-        raise ValueError(f"{field}: got {text if len(text) <= 500 else f'{text[:500]}...'}, expected {expected}")
+        raise ValueError(f"{field}: got {printable(repr(got))}, expected {expected}")
 
 
 def check_per_class(field: str, values: Collection[object], classes: Collection[str]) -> None:

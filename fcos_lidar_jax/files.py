@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-_MAX_TEXT = 1000  # of an exception, in characters
+from fcos_lidar_jax.fields import printable
 
 
 def atomic_write(path: str | Path, content: str | bytes | Callable[[Path], object]) -> None:
@@ -101,7 +101,8 @@ def refusing(
     try:
         yield
     except caught as error:
-        text = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())[:_MAX_TEXT]
+        text = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
+        text = printable(text or type(error).__name__, 1000)
         raise kind(f"{where}{': ' if where else ''}{text}{more}") from None
 
 
@@ -154,10 +155,9 @@ def check_writable(path: Path) -> None:
     """Reject a path at which :func:`atomic_write` would fail, as far as this is known without writing."""
     _check_kind(path)
     folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
-    if not folder.is_dir():
-        raise NotADirectoryError(f"{folder}: found a file, expected a folder to write to")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{folder}: found a folder without write permission, expected a folder to write to")
+    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        found = "a folder without write permission" if folder.is_dir() else "a file"
+        raise PermissionError(f"{folder}: found {found}, expected a folder to write to")
 
 
 def _check_kind(path: Path) -> None:
@@ -197,11 +197,9 @@ def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
     Raises:
         OSError: naming the file: another process writes to it, or a line cannot be written.
     """
-    with path.open("ab", buffering=0) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(f"{path}: in use: another process, expected no other process") from None
+    with file_lock(path) as held, path.open("ab", buffering=0) as file:
+        if not held:
+            raise BlockingIOError(f"{path}: in use: another process, expected no other process")
         file.truncate(0)
         size = 0  # Bytes of whole lines.
 
@@ -253,7 +251,7 @@ def _explain(message: str, content: Any) -> str:
         return message
     for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", place):
         content = content[key or int(index)]
-    got = text if len(text := repr(content)) <= 60 else f"{text[:57]}..."
+    got = printable(repr(content), 57)
     expected = re.fullmatch(r"Expected (.+?)(, got .*)?", problem.replace("`", ""))
     return f"{place or '$'}: {f'got {got}, expected {expected[1]}' if expected else f'{problem}, got {got}'}"
 

@@ -17,7 +17,7 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_poi
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, check_poses, fuse_sweeps
-from fcos_lidar_jax.files import some_files
+from fcos_lidar_jax.files import refusing, some_files
 from fcos_lidar_jax.geometry import pose_matrix, wrap_angle
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
 
@@ -56,10 +56,6 @@ class Argoverse2Frames(FrameSet):
     classes of the detection benchmark are dropped. Velocities are not annotated: they follow from the tracks in
     the city frame, by the rule of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, and are given along the
     ego vehicle's axes.
-
-    Raises:
-        ValueError: at construction or on reading a frame, with the file, the row, the field, the found and the
-            expected value.
     """
 
     classes = ARGOVERSE2_CLASSES
@@ -164,9 +160,8 @@ def _stamps(log: Path) -> list[int]:
     """Times of a log's sweeps in nanoseconds, from the file names."""
     stamps = []
     for file in some_files(log / _SWEEPS, ".feather", "sweeps, TIMESTAMP.feather"):
-        if not (file.stem.isascii() and file.stem.isdecimal()) or str(int(file.stem)) != file.stem:
-            raise ValueError(f"{file}: got {file.stem!r}, expected a name of whole nanoseconds")
-        stamps.append(int(file.stem))
+        with refusing(f"{file}: expected a name of whole nanoseconds", ValueError):
+            stamps.append(int(file.stem))
     return sorted(stamps)
 
 

@@ -20,18 +20,16 @@ def check_boxes(boxes: np.ndarray, place: Callable[[int], str]) -> None:
         boxes: [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``; an unknown velocity is NaN twice.
         place: row -> name of a box, for messages.
     """
-    finite, positive = np.isfinite(boxes), np.ones(boxes.shape, bool)
-    finite[:, 7:] |= np.isnan(boxes[:, 7:]).all(axis=1, keepdims=True)
-    positive[:, 3:6] = ~(boxes[:, 3:6] < np.finfo(np.float32).tiny)
-    near = ~(np.abs(boxes) > list(LIMITS.values()))
-    good = finite & positive & near
+    good = np.abs(boxes) <= list(LIMITS.values())
+    good[:, 3:6] &= boxes[:, 3:6] >= np.finfo(np.float32).tiny
+    good[:, 7:] |= np.isnan(boxes[:, 7:]).all(axis=1, keepdims=True)
     if good.all():
         return
     row, column = np.argwhere(~good)[0]
     name = list(LIMITS)[column]
+    kind = "a size above 0 m" if name in ("l", "w", "h") else "a finite number"
     unit = " radians" if name == "yaw" else ""
-    expected = f"at most {LIMITS[name]:g}{unit}" if positive[row, column] else "a size above 0 m"
-    expected = expected if finite[row, column] else "a finite number"
+    expected = f"{kind}, at most {LIMITS[name]:g}{unit}"
     raise ValueError(f"{place(int(row))}: {name}: got {boxes[row, column]:g}, expected {expected}")
 
 

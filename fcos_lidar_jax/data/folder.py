@@ -12,13 +12,7 @@ import numpy as np
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import point_files
 from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes, count_inside
-from fcos_lidar_jax.data.frame import (
-    Frame,
-    FrameSet,
-    drop_close,
-    files_fingerprint,
-    without_points,
-)
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, without_points
 from fcos_lidar_jax.data.splits import SPLITS, distinct_names, own_splits
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
 from fcos_lidar_jax.fields import check, check_name
@@ -55,10 +49,6 @@ class FolderFrames(FrameSet):
         sensor: replaces ``sensor.json``.
         split: take the frames and their order from a split; default: all frames, sorted.
         splits: JSON file with the splits; default: ``splits.json``.
-
-    Raises:
-        ValueError: at construction or on reading a frame, with the file, the field, the found and the expected
-            value.
     """
 
     def __init__(
@@ -86,7 +76,9 @@ class FolderFrames(FrameSet):
             raise ValueError(f"{self._clouds[name]}: no {root / _BOXES / name}.json, expected {expected}")
         self.names = tuple(sorted(self._clouds))
         """Names of the frames: file names without extension."""
-        self.sensor = read_sensor(root, self._inside) if sensor is None else sensor
+        for name in (_SENSOR, _CLASSES):
+            point_files.check_inside(root / name, self._inside, str(root / name))
+        self.sensor = read_sensor(root) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
             self.names = _read_split(root, splits, split, self._clouds)
@@ -126,7 +118,6 @@ class FolderFrames(FrameSet):
             check(is_own, f"{listed}: $[0].file", files[0], f"the frame's own cloud, '../clouds/{cloud.name}'")
 
     def fingerprint(self) -> str:
-        self.check_files(range(len(self)))
         listed = (file.parent / sweep.file for file in self._sweeps.values() for sweep in read_list(file))
         clouds = {os.path.normpath(file) for file in self._clouds.values()}
         older = {Path(path) for path in map(os.path.normpath, listed) if path not in clouds}
@@ -173,7 +164,6 @@ class FolderFrames(FrameSet):
         file = self.root / _CLASSES
         classes: list[str] | dict[str, str | None] = {}
         if os.path.lexists(file):
-            point_files.check_inside(file, self._inside, str(file))
             classes = read_json(file, list[str] | dict[str, str | None])
         if isinstance(classes, list):
             if not classes or len(set(classes)) < len(classes):
@@ -181,10 +171,8 @@ class FolderFrames(FrameSet):
             return tuple(classes), {}
         given = {r.label for boxes in self._boxes.values() for r in read_json(boxes, _Annotation).boxes}
         if unused := classes.keys() - given:
-            tell(
-                f"note: {file}: no box has the label {min(unused)!r}; labels: {', '.join(sorted(given))}",
-                once=True,
-            )
+            labels = ", ".join(sorted(given))
+            tell(f"note: {file}: no box has the label {min(unused)!r}; labels: {labels}", once=True)
         names = {classes.get(label, label) for label in given}
         return tuple(sorted(name for name in names if name is not None)), classes
 
@@ -229,11 +217,9 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
     point_files.check_inside(file, inside, where)
 
 
-def read_sensor(root: Path, inside: Path | None = None) -> Sensor:
-    """Read ``sensor.json`` of a folder, which no link may lead out of the folder ``inside``."""
-    file = root / _SENSOR
-    point_files.check_inside(file, inside, str(file))
-    return load_sensor(file)
+def read_sensor(root: Path) -> Sensor:
+    """Read ``sensor.json`` of a folder."""
+    return load_sensor(root / _SENSOR)
 
 
 def _read_split(root: Path, file: str | Path | None, split: str, clouds: Collection[str]) -> tuple[str, ...]:

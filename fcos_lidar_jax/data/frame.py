@@ -41,6 +41,10 @@ class FrameSet(Protocol):
     """Frames in a fixed order: the interface of every reader for the training pipeline and the commands.
 
     Readers inherit from it and get defaults for anything that their data lack (poses, times, scenes).
+
+    Raises:
+        ValueError: at construction or on reading a frame, with the file, the place in it, the field, the found and
+            the expected value.
     """
 
     classes: tuple[str, ...]  # Class names, which labels index.

@@ -6,15 +6,10 @@ from itertools import pairwise
 import numpy as np
 
 from fcos_lidar_jax.data.drives import PoseRow, PoseTrack, make_track
+from fcos_lidar_jax.fields import printable
 
 _ODOM = "odom"  # by ROS's REP 105 it never jumps; frames above it may
 _MAX_LISTED = 20  # frames listed in a message
-
-
-def printable(text: str) -> str:
-    """A recording's text for one line of a message: at most 500 printable characters."""
-    text = text if text.isprintable() else repr(text)
-    return text if len(text) <= 500 else text[:500] + "..."
 
 
 class FrameTree:

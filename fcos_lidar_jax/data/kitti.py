@@ -62,10 +62,6 @@ class KittiFrames(FrameSet):
             frames, sorted.
         full_turn: keep the points outside the image.
         reading: which points on the ego vehicle are dropped; a frame is one sweep.
-
-    Raises:
-        ValueError: at construction or on reading a frame, with the file, the line, the field, the found and the
-            expected value.
     """
 
     classes = CLASSES

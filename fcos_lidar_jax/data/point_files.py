@@ -135,14 +135,13 @@ def check_time_lags(lag: np.ndarray, where: Path | str = "points", num_sweeps: i
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
     if not lag.size:
         return
-    most, expected = float(lag.max()), "expected the time lag in seconds: leave the column out"
-    if most >= _UNIX_S and np.median(lag) >= _UNIX_S:  # a few may be damage
-        raise ValueError(
-            f"{where}: fifth column: got values up to {most:g}, which look like Unix time, {expected}"
-        )
-    if most > 1 and not (lag % 1).any():
-        found = f"got whole numbers up to {most:g}, which look like a ring"
-        raise ValueError(f"{where}: fifth column: {found}, {expected}, or put 0 into it and the ring into a sixth")
+    most = float(lag.max())
+    is_unix = most >= _UNIX_S and np.median(lag) >= _UNIX_S  # a few may be damage
+    if is_unix or (most > 1 and not (lag % 1).any()):
+        kind = "values" if is_unix else "whole numbers"
+        found = f"{kind} up to {most:g}, which look like {'Unix time' if is_unix else 'a ring'}"
+        expected = "the time lag in seconds: leave the column out, or put 0 into it and a ring into a sixth"
+        raise ValueError(f"{where}: fifth column: got {found}, expected {expected}")
     check_num_lags(lag, where, num_sweeps)
 
 
@@ -199,12 +198,9 @@ def _read_whole(path: Path, max_points: int) -> bytes:
     limit = max_points * BYTES_PER_POINT + _HEADER_BYTES
     with refusing(f"{path}: cannot be read", OSError):
         size = path.stat().st_size
-        if size > limit:
-            raise ValueError(f"{path}: got {size} bytes, expected at most {limit} for {max_points} points")
-        content = path.read_bytes()
-    if not content:
-        raise ValueError(f"{path}: empty file, expected points")
-    return content
+        if not 0 < size <= limit:
+            raise ValueError(f"{path}: got {size} bytes, expected 1 to {limit} for at most {max_points} points")
+        return path.read_bytes()
 
 
 def _kind(path: Path, *, raw: bool) -> str:

@@ -18,11 +18,12 @@ import numpy as np
 
 from fcos_lidar_jax.data.drives import Drive, OutsidePosesError, PoseRow, PoseTrack, make_track, read_tum
 from fcos_lidar_jax.data.frame import no_points
-from fcos_lidar_jax.data.frame_tree import FrameTree, printable
+from fcos_lidar_jax.data.frame_tree import FrameTree
 from fcos_lidar_jax.data.pcd import find_columns
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, assemble_points
 from fcos_lidar_jax.data.sweeps import Sweep
-from fcos_lidar_jax.files import import_extra
+from fcos_lidar_jax.fields import printable
+from fcos_lidar_jax.files import import_extra, refusing
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor
 
@@ -118,10 +119,7 @@ class _Bag(contextlib.AbstractContextManager):
         import_extra("rosbags", "ros", f"{path}: ")
         from rosbags import rosbag1, rosbag2
 
-        files = [path, *path.iterdir()] if path.is_dir() else [path]
-        if odd := [file for file in files if file.suffix == ".db3" and set("%?#") & set(str(file))]:
-            raise ValueError(f"{printable(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")
-        with _refusing(str(path)), contextlib.ExitStack() as opened:
+        with refusing(f"{path}: cannot be read"), contextlib.ExitStack() as opened:
             self.path, parts = path, _files(path)
             self._is_ros1 = parts[0].suffix == ".bag"
             kind: Any = rosbag1 if self._is_ros1 else rosbag2
@@ -151,8 +149,7 @@ class _Bag(contextlib.AbstractContextManager):
             for (topic, kind), count in sorted(self.counts.items())
             if not fitting or kind in types
         ]
-        more = [f"{len(listed) - _MAX_LISTED} more"] if len(listed) > _MAX_LISTED else []
-        topics = ", ".join(listed[:_MAX_LISTED] + more) or "none"
+        topics = ", ".join(listed[:_MAX_LISTED]) or "none"
         found = f"{len(fitting)} topics and no name" if name is None else repr(name)
         raise ValueError(f"{self.path}: {option}: got {found}, expected a topic of {names} among: {topics}")
 
@@ -164,7 +161,7 @@ class _Bag(contextlib.AbstractContextManager):
         raw = heapq.merge(*sources, key=lambda record: record[1])  # by time of recording
         while True:
             where = f"{self.path}: {printable(topic)}: message {number}"
-            with _refusing(where):
+            with refusing(f"{where}: cannot be read"):
                 if (record := next(raw, None)) is None:
                     return
                 connection, _, content = record
@@ -185,15 +182,6 @@ def _typestore(is_ros1: bool) -> Any:
     for kind in _TRANSFORMS:  # missing in rosbags
         types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
     return types
-
-
-@contextlib.contextmanager
-def _refusing(where: str) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:  # damaged recordings raise arbitrary exceptions of rosbags, SQLite, YAML, ...
-        kind = "" if type(error).__module__.startswith("rosbags") else f"{type(error).__name__}: "
-        raise ValueError(f"{where}: cannot be read: {kind}{printable(' '.join(str(error).split()))}") from None
 
 
 def _frame(name: str) -> str:

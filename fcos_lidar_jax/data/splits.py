@@ -21,12 +21,12 @@ def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], wh
 
     ``listed`` pairs the place of each name, for messages, with the name; ``where`` is the place of the list.
     """
-    names: dict[str, None] = {}
+    names: list[str] = []
+    left = set(known)
     for place, name in listed:
-        check(name in known, place, name, "the name of a cloud")
-        if name in names:
-            raise ValueError(f"{place}: got {name!r} a second time, expected every frame once")
-        names[name] = None
+        check(name in left, place, name, "the name of a cloud, each once")
+        left.remove(name)
+        names.append(name)
     if not names:
         raise ValueError(f"{where}: no frame in it, expected at least one")
     return tuple(names)

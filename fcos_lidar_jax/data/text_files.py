@@ -47,9 +47,9 @@ def read_matrices(
         if (name := name.removesuffix(":")) not in shapes:
             continue
         where = f"{where}: {name}"
-        if len(words) != np.prod(shapes[name]):
-            raise ValueError(f"{where}: got {len(words)} numbers, expected {np.prod(shapes[name])}")
-        matrices[name] = np.array([read_number(word, where) for word in words]).reshape(shapes[name])
+        numbers = np.array([read_number(word, where) for word in words])
+        with refusing(where, ValueError):
+            matrices[name] = numbers.reshape(shapes[name])
         if name in rotations and not is_rotation(matrices[name][:, :3]):
             raise ValueError(f"{where}: got no rotation in its 3x3, expected orthonormal rows")
     for name in shapes:

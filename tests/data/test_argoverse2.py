@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
-from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 
 STEP_NS = 100_000_000
 WORLD = np.array([[712.0, 1310, -20], [706, 1322, -21.5], [731, 1301, -22], [700, 1290, -23]])
@@ -169,10 +167,16 @@ def boxes(**changes):
     return lambda log: write_boxes(log, [row(0), row(1, **changes)])
 
 
+def late(log):
+    """The first sweep has no pose, and no boxes."""
+    write_poses(log, np.array([START_NS + STEP_NS]), ego(1)[None])
+    write_boxes(log, [row(1)])
+
+
 ONE = np.array([1, 0, 0, 0.0])
 BAD = {
     "no poses": (lambda log: (log / P).unlink(), P, "cannot be read: No such file or directory"),
-    "empty": (rewrite(P, lambda _: b""), P, "empty file"),
+    "empty": (rewrite(P, lambda _: b""), P, "got 0 bytes, expected 1 to"),
     "cut": (rewrite(A, lambda content: content[:-40]), A, "not a readable .feather file: "),
     "no column": (change(P, qz=None), P, 'Field "qz" does not exist'),
     "text": (change(S, x=["one"] * 4), S, "x: got string, expected numbers"),
@@ -182,7 +186,8 @@ BAD = {
     "no size": (boxes(box=[9, 0, 0, 4, 0, 1.5, 0]), A, "row 1: w: got 0, expected a size above 0 m"),
     "laser": (change(S, laser_number=np.array([0, 1, 64, 2], np.uint8)), S, "laser number: got 64 in row 2"),
     "box without a pose": (boxes(time_ns=5), P, "no pose at 5 ns, expected one for every"),
-    "name": (lambda log: (log / S).rename(log / FIRST), FIRST, "got 'first', expected a name of whole nanosec"),
+    "sweep without a pose": (late, P, f"no pose at {START_NS} ns, expected one for every sweep"),
+    "name": (lambda log: (log / S).rename(log / FIRST), FIRST, "expected a name of whole nanosec"),
 }
 
 
@@ -193,23 +198,6 @@ def test_damaged_files_of_a_log_are_refused(tmp_path, case):
     edit(log)
     with refused(message, log / file):
         Argoverse2Frames(tmp_path).frame(0)
-
-
-def test_a_sweep_without_its_pose_is_refused(root):
-    log = root / "train" / "log-a"
-    write_poses(log, START_NS + STEP_NS * np.arange(3), np.array([ego(i) for i in range(3)]))
-    write_boxes(log, [row(0)])
-    frames = Argoverse2Frames(root)
-    assert len(frames.frame(2).boxes) == 0
-    with refused(f"no pose at {START_NS + 3 * STEP_NS} ns"):
-        frames.frame(3)
-
-
-def test_a_sweep_can_be_read_as_a_point_file(root):
-    """Sensors whose rows follow from the inclination need no laser number."""
-    for sensor, columns in ((ARGOVERSE2, 6), (TINY, 5)):
-        read = read_points(root / "train" / "log-a" / S, sensor)
-        np.testing.assert_array_equal(read, Argoverse2Frames(root).frame(0).points[:, :columns])
 
 
 def test_without_pyarrow_the_error_names_the_extra(root, monkeypatch):

@@ -1,6 +1,7 @@
 """Drives: clouds with poses from files, and scenes of nuScenes."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,10 +28,19 @@ def poses(tmp_path):
     return tmp_path
 
 
+def drive_of(folder, *names, poses="poses.txt"):
+    """Write clouds and open the drive with their poses."""
+    for name in names:
+        np.save(folder / "clouds" / f"{name}.npy", CLOUD)
+    return folder_drive(folder / "clouds", TINY, poses and folder / poses)
+
+
+def names_of(sweeps):
+    return [Path(sweep.name).stem for sweep in sweeps]
+
+
 def test_poses_are_interpolated_if_file_names_are_times(poses):
-    for name in ("0.0", "0.1", "0.4"):
-        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
-    drive = folder_drive(poses / "clouds", TINY, poses / "poses.txt")
+    drive = drive_of(poses, "0.0", "0.1", "0.4")
     for sweep, share in zip(drive.sweeps, (0, 0.25, 1), strict=True):
         assert sweep.time_us == 400_000 * share
         expected = Rotation.from_euler("z", 90 * share, degrees=True).as_matrix()
@@ -40,14 +50,9 @@ def test_poses_are_interpolated_if_file_names_are_times(poses):
 
 def test_clouds_named_by_times_are_in_temporal_order(poses):
     (poses / "poses.txt").write_text("9.8 0 0 0 0 0 0 1\n10.2 4 0 0 0 0 0 1\n")
-    for name in ("9.9", "10.0", "10.1", "9.8"):
-        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
-    sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
+    sweeps = list(drive_of(poses, "9.9", "10.0", "10.1", "9.8").sweeps)
+    assert names_of(sweeps) == names_of(drive_of(poses, poses=None).sweeps) == ["9.8", "9.9", "10.0", "10.1"]
     assert [sweep.time_us for sweep in sweeps] == [9_800_000, 9_900_000, 10_000_000, 10_100_000]
-    names = [sweep.name.rpartition("/")[2] for sweep in sweeps]
-    assert names == ["9.8.npy", "9.9.npy", "10.0.npy", "10.1.npy"]
-    unposed = folder_drive(poses / "clouds", TINY).sweeps
-    assert [sweep.name.rpartition("/")[2] for sweep in unposed] == names
     np.testing.assert_allclose([sweep.sensor_to_world[0, 3] for sweep in sweeps], [0, 1, 2, 3], atol=1e-12)
 
 
@@ -74,26 +79,20 @@ def test_clouds_that_jump_are_told_once(capsys, numbers, places_m, step_s, told)
 
 
 def test_clouds_with_other_names_need_one_pose_each(poses):
-    for name in ("b", "a"):
-        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
-    sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
-    assert [(sweep.name[-5:], sweep.time_us) for sweep in sweeps] == [("a.npy", 0), ("b.npy", 400_000)]
-    assert sweeps[1].sensor_to_world[0, 3] == 3
-    np.save(poses / "clouds" / "c.npy", CLOUD)
+    sweeps = list(drive_of(poses, "b", "a").sweeps)
+    assert names_of(sweeps) == ["a", "b"]
+    assert [(sweep.time_us, sweep.sensor_to_world[0, 3]) for sweep in sweeps] == [(0, 1), (400_000, 3)]
     with refused("poses.txt: got 2 poses for 3 clouds, expected one per cloud"):
-        folder_drive(poses / "clouds", TINY, poses / "poses.txt")
+        drive_of(poses, "c")
 
 
 def test_names_that_are_not_sorted_by_their_numbers_are_refused(poses):
-    for name in ("sweep_9", "sweep_10"):
-        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
-    for more, where in (((poses / "poses.txt",), "poses.txt"), ((), "clouds")):
+    for file, where in (("poses.txt", "poses.txt"), (None, "clouds")):
         with refused(f"{where}: clouds are sorted by name: got sweep_10.npy before sweep_9.npy, expected numbers"):
-            folder_drive(poses / "clouds", TINY, *more)
+            drive_of(poses, "sweep_9", "sweep_10", poses=file)
     (poses / "clouds" / "sweep_9.npy").rename(poses / "clouds" / "sweep_09.npy")
-    np.save(poses / "clouds" / "._sweep_09.npy", CLOUD)  # hidden files of macOS are skipped
-    sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
-    assert [sweep.name[-6:] for sweep in sweeps] == ["09.npy", "10.npy"]
+    drive = drive_of(poses, "._sweep_09")  # hidden files of macOS are skipped
+    assert names_of(drive.sweeps) == ["sweep_09", "sweep_10"]
 
 
 @pytest.mark.parametrize(
@@ -104,14 +103,11 @@ def test_names_that_are_not_sorted_by_their_numbers_are_refused(poses):
     ],
 )
 def test_a_list_needs_every_cloud_once(poses, names, message):
-    np.save(poses / "clouds" / "a.npy", CLOUD)
-    pose = np.eye(4).tolist()
-    listed = [
-        {"file": f"clouds/{name}.npy", "sensor_to_world": pose, "timestamp_us": i} for i, name in enumerate(names)
-    ]
+    entry = {"sensor_to_world": np.eye(4).tolist(), "timestamp_us": 0}
+    listed = [{"file": f"clouds/{name}.npy", **entry} for name in names]
     (poses / "poses.json").write_text(json.dumps(listed))
     with refused(message):
-        folder_drive(poses / "clouds", TINY, poses / "poses.json")
+        drive_of(poses, "a", poses="poses.json")
 
 
 @pytest.mark.parametrize(
@@ -124,19 +120,15 @@ def test_a_list_needs_every_cloud_once(poses, names, message):
         ("1 2 3", "line 1: got '1 2 3', expected t x y z qx qy qz qw"),
         ("# t\n1 0 0 nan 0 0 0 1", "line 2: got 'nan', expected a finite number"),
         ("1e999 0 0 0 0 0 0 1", "line 1: got '1e999', expected a finite number of at most 1e+12"),
-        ("# nothing", "no pose in it"),
+        ("# nothing", "0.1.npy: at 0.1 s: a gap in the poses"),
         (None, "no such file"),
     ],
 )
 def test_poses_that_do_not_fit_are_refused(poses, text, message):
-    np.save(poses / "clouds" / "0.1.npy", CLOUD)
     file = poses / "poses.txt"
-    if text is None:
-        file.unlink()
-    else:
-        file.write_text(text)
+    file.unlink() if text is None else file.write_text(text)
     with refused(message, file):
-        folder_drive(poses / "clouds", TINY, file)
+        drive_of(poses, "0.1")
 
 
 def test_poses_that_turn_z_down_are_told(tmp_path, capsys):

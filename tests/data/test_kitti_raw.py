@@ -52,16 +52,8 @@ def test_the_calibration_of_the_day_is_found_from_within_the_drive(recording, mo
         ("oxts/data/0000000001.txt", "49 8 110 0 x 0", "0000000001.txt: pitch: got 'x', expected a fi"),
         ("oxts/data/0000000001.txt", "49 8 110 0", "0000000001.txt: got 4 numbers, expected at least 6"),
         ("oxts/data/0000000000.txt", "90 8 110 0 0 0", "latitude: got '90', expected a finite number of at m"),
-        (
-            "velodyne_points/timestamps.txt",
-            "2011-09-26 13:02:25.5",
-            "line 2: time of 0000000001.bin: Invalid isoformat string: ''",
-        ),
-        (
-            "velodyne_points/timestamps.txt",
-            "today\n",
-            "line 1: time of 0000000000.bin: Invalid isoformat string: 'today'",
-        ),
+        ("velodyne_points/timestamps.txt", "2011-09-26 13:02:25.5", "line 2: time of 0000000001.bin: Invalid iso"),
+        ("velodyne_points/timestamps.txt", "today\n", "line 1: time of 0000000000.bin: Invalid isoformat string"),
         ("../calib_imu_to_velo.txt", None, "calib_imu_to_velo.txt: no such file"),
         ("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 -1\nT: 0 0 0", "line 1: R: got no rotation in its 3x3"),
         ("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 1", "calib_imu_to_velo.txt: T: missing, expected R, T"),

@@ -151,27 +151,18 @@ def test_a_missing_older_sweep_is_skipped_if_allowed(tmp_path):
         data.sweeps(sample, 4)
 
 
-PARTIAL = {  # missing files, whether fewer sweeps are allowed, fragments of the message
-    "none": ([], False),
-    "a blob of keyframes": (
-        *(["0-3", "0-6"], False, "root: 2 of 8 keyframes are missing, such as "),
-        "0-3.pcd.bin: expected the rest of the download, or --splits",
-    ),
-    "keyframes, with fewer sweeps": (
-        *(["0-3", "0-5"], True, "root: 1 of 8 keyframes are missing"),
-        r"whole scenes \(1 of 2\): scene-1$",
-    ),
-    "older sweeps": (
-        *(["0-5"], False, "root: older sweeps of 1 of 8 keyframes are missing, such as "),
-        "0-5.pcd.bin: .*--allow-missing-sweeps for fewer sweeps",
-    ),
-    "older sweeps, allowed": (["0-5"], True),
+PARTIAL = {  # missing files, whether fewer sweeps are allowed, the message
+    "none": ([], False, ""),
+    "keyframes": (["0-3", "0-6"], False, "2 of 8 keyframes are missing, such as .*0-3.pcd.bin: expected the rest"),
+    "keyframes, fewer sweeps": (["0-3", "0-5"], True, r"1 of 8 keyframes .* whole scenes \(1 of 2\): scene-1$"),
+    "older sweeps": (["0-5"], False, "older sweeps of 1 of 8 keyframes .*0-5.pcd.bin: .*--allow-missing-sweeps f"),
+    "older sweeps, allowed": (["0-5"], True, ""),
 }
 
 
 @pytest.mark.parametrize("case", PARTIAL)
 def test_partial_downloads_are_counted_before_the_first_frame(tmp_path, monkeypatch, case):
-    files, allowed, *fragments = PARTIAL[case]
+    files, allowed, message = PARTIAL[case]
     root = write(tmp_path / "root", *make_tables(2))
     for name in files:
         (root / f"samples/LIDAR_TOP/{name}.pcd.bin").unlink()
@@ -179,17 +170,17 @@ def test_partial_downloads_are_counted_before_the_first_frame(tmp_path, monkeypa
     frames = open_frames(root, num_sweeps=4, allow_missing_sweeps=allowed)
     frames.truth(0)  # needs no cloud
     SelectedFrames(frames, (4, 0)).check_files(range(2))
-    if not fragments:
+    if not message:
         frames.check_files(range(8))
         return
-    with pytest.raises(ValueError, match=".*".join(fragments)):
+    with pytest.raises(ValueError, match=f"root: {message}"):
         MappedFrames(frames, NUSCENES_CLASSES).check_files(range(8))
     detector, unused = Mock(spec=TrainedDetector), {"entries": pytest.fail, "write": pytest.fail}
     for use in (
         lambda: write_predictions(detector, frames, tmp_path / "results", **unused),
         lambda: prepare_database(frames, tmp_path / "objects"),
     ):
-        with pytest.raises(ValueError, match=".*".join(fragments)):
+        with pytest.raises(ValueError, match=f"root: {message}"):
             use()
     assert not (tmp_path / "objects").exists()
 
@@ -216,18 +207,14 @@ def change(table: str, row: int, **fields: Any):
 
 
 SWEEP = "samples/LIDAR_TOP/0-3.pcd.bin"
-
-
 S, D, B, C, P = "sample", "sample_data", "sample_annotation", "calibrated_sensor", "ego_pose"
 BAD = {
     "missing table": (lambda r: (r / VERSION / "instance.json").unlink(), "instance.json", "no such file"),
     "empty table": (rewrite("scene", lambda text: ""), "scene.json", "an empty one"),
     "truncated table": (rewrite(B, lambda text: text[:-200]), f"{B}.json: from row 0 on: "),
-    "not a list": (rewrite("category", lambda text: "{}"), "category.json", "array", "object"),
     "field missing": (change(S, 3, timestamp=None), "sample.json", "[3]", "timestamp"),
-    "two lengths": (change(B, 2, size=[1, 2]), f"{B}.json", "[2].size", "3"),
-    "negative size": (change(B, 2, size=[1, -2, 1]), f"{B}.json", "box-0-0-2", "size: got [1.0, -2.0, 1.0]"),
-    "absurd size": (change(B, 2, size=[1, 1e30, 1]), "box-0-0-2", "1e+30", "positive", "at most 500 m"),
+    "negative size": (change(B, 2, size=[1, -2, 1]), f"{B}.json", "> 0.0", "$[2].size[1]"),
+    "absurd size": (change(B, 2, size=[1, 1e30, 1]), f"{B}.json", "<= 500.0", "$[2].size[1]"),
     "absurd place": (change(B, 2, translation=[1, 1e30, 1]), f"{B}.json", "box-0-0-2", "translation", "1e+08 m"),
     "rotation of a box": (change(B, 4, rotation=[1, 1, 0, 0]), f"{B}.json", "box-0-1-0", "rotation", "unit quat"),
     "mount": (change(C, 0, rotation=[2, 0, 0, 0]), f"{C}.json", "mount", "rotation"),
@@ -237,11 +224,10 @@ BAD = {
     "token twice": (change(D, 1, token=token("data", 0, 2)), f"{D}.json", "data-0-2", "twice"),
     "path above the root": (change(D, 3, filename="../x.pcd.bin"), "data-0-3", "filename", "'../x.pcd.bin'"),
     "absolute path": (change(D, 3, filename="/etc/passwd"), "data-0-3", "filename", "'/etc/passwd'"),
-    "zero-length sweep": (lambda root: (root / SWEEP).write_bytes(b""), "0-3.pcd.bin", "an empty file"),
+    "zero-length sweep": (lambda root: (root / SWEEP).write_bytes(b""), "0-3.pcd.bin", "got 0 bytes"),
     "truncated sweep": (lambda root: (root / SWEEP).write_bytes(bytes(1999)), "0-3.pcd.bin", "1999 bytes", "20"),
     "scene unknown": (lambda root: "lost", "scene-99", "scene.json"),
-    "split without scenes": (lambda root: "none", "splits.json", "none", "no scene"),
-    "unknown split": (lambda root: "vall", "'vall'", "splits.json", "scene-0"),
+    "split without scenes": (lambda root: "none", "'none'", "got no keyframe"),
 }
 for table, row, field, record in (
     (B, 2, "sample_token", "box-0-0-2"),
@@ -303,8 +289,6 @@ def test_unusable_roots_and_indexes_are_refused(made, tmp_path):
         NuScenes(made, "v1.0-other")
     with refused("index.json: no such file, expected a finished index"):
         NuScenes(made, VERSION, index=tmp_path / "gone")
-    with refused("sample.json: 'gone': no such token"):
-        NuScenes(made, VERSION).boxes("gone")
     folder = tmp_path / "index"
     save_index(build_index(made / VERSION), folder, tables=made / VERSION)
     manifest, column = folder / "index.json", folder / "box_size.npy"

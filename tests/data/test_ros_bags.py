@@ -10,7 +10,7 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, TINY
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, TINY
 
 START_NS = 1_700_000_000_123_456_789
 POINTS = structured(np.random.default_rng(0).uniform(1, 20, (12, 4)).astype(np.float32))
@@ -18,8 +18,17 @@ NO_TURN = (0, 0, 0, 1)
 VELOCITY, YAW_RATE = np.array([8.0, -3.0, 0.5]), 0.7
 
 
-def one_cloud(make):
-    return [("/p", make.cloud(1, POINTS))]
+def clouds(*stamps_ns, texts=0):
+    """Clouds after messages of another topic."""
+
+    def content(make):
+        yield from [("/chatter", make.text("hello"))] * texts
+        yield from (("/p", make.cloud(stamp, POINTS)) for stamp in stamps_ns)
+
+    return content
+
+
+one_cloud = clouds(1)
 
 
 def one_sweep(folder, points, **changed):
@@ -112,15 +121,8 @@ def test_folders_of_files_are_read_in_the_order_of_recording(tmp_path, form):
     folder = tmp_path / "files"
     folder.mkdir()
     for name, before in (("a_9", 0), ("a_10", 3)):
-        bag = write_recording(
-            tmp_path / name,
-            form,
-            lambda make, before=before: [
-                *[("/chatter", make.text("hello"))] * before,
-                *(("/p", make.cloud((before + i) * 1000, POINTS)) for i in range(3)),
-            ],
-        )
-        file = data_file(bag)
+        stamps_ns = [(before + i) * 1000 for i in range(3)]
+        file = data_file(write_recording(tmp_path / name, form, clouds(*stamps_ns, texts=before)))
         file.rename(folder / f"{name}{file.suffix}")
     assert is_ros_bag(folder)
     sweeps = list(ros_bag_drive(folder, TINY).sweeps)
@@ -132,28 +134,21 @@ def test_folders_of_files_are_read_in_the_order_of_recording(tmp_path, form):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_without_odometry_sweeps_have_times_but_no_poses(tmp_path, form):
-    bag = write_recording(
-        tmp_path / "a",
-        form,
-        lambda make: [
-            ("/chatter", make.text("hello")),
-            *(("/p", make.cloud(START_NS + i * 10**8, POINTS)) for i in range(3)),
-        ],
-    )
+    stamps_ns = [START_NS + i * 10**8 for i in range(3)]
+    bag = write_recording(tmp_path / "a", form, clouds(*stamps_ns, texts=1))
     assert is_ros_bag(bag)
     drive = ros_bag_drive(bag, TINY)
     assert (drive.posed, drive.timed) == (False, True)
     sweeps = list(drive.sweeps)
     assert [sweep.name for sweep in sweeps] == [f"{bag}: /p: message {i}" for i in range(3)]
-    assert [sweep.time_us for sweep in sweeps] == [START_NS // 1000 + i * 10**5 for i in range(3)]
+    assert [sweep.time_us for sweep in sweeps] == [stamp // 1000 for stamp in stamps_ns]
 
 
 def test_clouds_of_several_sensors_on_one_topic_are_told_once(tmp_path, capsys):
-    def clouds(make):
-        for number in range(6):
-            yield "/points", make.cloud(START_NS + number * 10**8, POINTS, ("lidar", "/lidar", "rear")[number % 3])
-
-    bag = write_recording(tmp_path / "a", "mcap", clouds)
+    frames = ["lidar", "/lidar", "rear"] * 2
+    bag = write_recording(
+        tmp_path / "a", "mcap", lambda make: [("/points", make.cloud(START_NS, POINTS, frame)) for frame in frames]
+    )
     assert len(list(ros_bag_drive(bag, TINY).sweeps)) == 6
     told = f"note: {bag}: /points: message 2: frame_id 'rear' after 'lidar': clouds of several sensors?\n"
     assert capsys.readouterr().err == told
@@ -301,12 +296,6 @@ def test_clouds_outside_the_poses_are_skipped_with_a_note(tmp_path):
         list(ros_bag_drive(bag, TINY, odometry="/odom").sweeps)
 
 
-@pytest.mark.parametrize("name", ["a%20b.db3", "a?mode=rw.db3", "a#b.db3"])
-def test_file_names_that_sqlite_misreads_are_refused(tmp_path, name):
-    with refused(f"{name}: %, ? or # in the name"):
-        ros_bag_drive(tmp_path / name, TINY)
-
-
 def moving(*names):
     return lambda make: (
         ("/tf", make.transform(t, parent, child, *motion(seconds)))
@@ -326,50 +315,33 @@ def standing(*stamps_ns, **last):
     return content
 
 
-WRONG_DRIVES = {  # source of the poses, their messages, fragments of the message
-    "another topic of odometry": (
-        *("/odm", standing(0), "odometry: got '/odm', expected"),
-        "among: /odom (nav_msgs/msg/Odometry, 1 messages)",
-    ),
+TWO_PARENTS = moving(("odom", "base_link"), ("map", "base_link"))
+WRONG_DRIVES = {  # source of the poses, their messages, the message
+    "another topic of odometry": ("/odm", standing(0), "odometry: got '/odm', expected a topic of Odometry or Po"),
     "a gap": ("/odom", standing(0, 6 * 10**8), "/points: message 0: /odom: at 1700000000.173456 s: a gap in the"),
-    "time going back": (
-        *("/odom", standing(5000, 4000), "/odom: message 1: time: got 1700000000.12346 s after"),
-        "1700000000.123461 s, expected a later one",
-    ),
-    "no unit quaternion": (
-        *("/odom", standing(0, 4000, turn=(0, 0, 0, 0))),
-        "/odom: message 1: rotation: got [0.0, 0.0, 0.0, 0.0], expected a unit quaternion",
-    ),
-    "other frames": (
-        *("/odom", standing(0, 4000, child="imu")),
-        "/odom: message 1: child_frame_id: got 'imu', expected 'base_link' as before",
-    ),
+    "time going back": ("/odom", standing(5000, 4000), "/odom: message 1: time: got 1700000000.12346 s after 170"),
+    "no rotation": ("/odom", standing(0, 4000, turn=(0, 0, 0, 0)), "/odom: message 1: rotation: got [0.0, 0.0, 0"),
+    "other frames": ("/odom", standing(0, 4000, child="imu"), "/odom: message 1: child_frame_id: got 'imu', expe"),
     "no transform": (
-        *("/odom", odometry_of("chassis"), "/points: message 0: no transform from 'lidar' to 'chassis', expected"),
-        "transforms of: imu, lidar, mount",
+        *("/odom", odometry_of("chassis")),
+        "/points: message 0: no transform from 'lidar' to 'chassis', expected one in /tf_static or /tf, which "
+        "have transforms of: imu, lidar, mount",
     ),
-    "nothing that moves": (
-        "tf",
-        standing(),
-        "got the frames lidar -> mount -> base_link, expected one that moves",
-    ),
+    "nothing that moves": ("tf", standing(), "got the frames lidar -> mount -> base_link, expected one that move"),
     "a gap in transforms": (
         *("tf", lambda make: np.delete(list(moving(("odom", "base_link"))(make)), range(2, 8), axis=0)),
         "/points: message 1: tf of base_link in odom: at 1700000000.323456 s: a gap in the poses",
     ),
-    "two parents": (
-        *("tf", moving(("odom", "base_link"), ("map", "base_link"))),
-        "a: tf: frame 'base_link' has 2 parents, expected a tree",
-    ),
+    "two parents": ("tf", TWO_PARENTS, "a: tf: frame 'base_link' has 2 parents, expected a tree"),
     "a circle": ("tf", moving(("lidar", "base_link")), "a: tf: frame 'base_link' is its own ancestor, expected a"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG_DRIVES)
 def test_unusable_poses_are_refused(tmp_path, case):
-    source, poses, *fragments = WRONG_DRIVES[case]
+    source, poses, message = WRONG_DRIVES[case]
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, poses))
-    with refused(f"{bag}: ", *fragments):
+    with refused(message, f"{bag}: "):
         list(ros_bag_drive(bag, TINY, odometry=source).sweeps)
 
 
@@ -399,10 +371,7 @@ def field(offset, datatype, count):
 
 
 WRONG_CLOUDS = {
-    "too short": (
-        {"data": np.zeros(191, np.uint8)},
-        "data: got 191 bytes, and row_step 192, expected 1 rows of 12",
-    ),
+    "too short": ({"data": np.zeros(191, np.uint8)}, "data: got 191 bytes, and row_step 192, expected 1 rows of"),
     "huge": ({"width": 2**32 - 1, "height": 2**32 - 1}, "x 4294967295 points, expected at most 10000000"),
     "wide rows": ({"row_step": 2**32 - 1, "height": 2}, "data: got 192 bytes, and row_step 4294967295"),
     "narrow rows": ({"row_step": 100, "width": 7, "height": 2}, "data: got 192 bytes, and row_step 100"),
@@ -426,14 +395,6 @@ def test_damaged_clouds_are_refused(tmp_path, case):
 )
 def test_messages_without_points_are_empty_sweeps(tmp_path, changed):
     assert one_sweep(tmp_path, POINTS[:0], **changed).points.shape == (0, 5)
-
-
-def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):
-    bag = write_recording(tmp_path / "a", "sqlite", one_cloud)
-    with refused("/p: message 0: got 12 x 1 points, expected at most 11"):
-        list(ros_bag_drive(bag, NUSCENES_HDL32E, max_points=11).sweeps)
-    with refused("/p: message 0: no laser number in it"):
-        list(ros_bag_drive(bag, ARGOVERSE2).sweeps)
 
 
 @pytest.mark.parametrize(

@@ -102,21 +102,13 @@ def test_an_impossible_pose_is_refused_with_its_row_and_field(rotation, place, m
 BAD_SWEEPS = {
     "empty": ([], "$: got [], expected array of length >= 1"),
     "no pose": ([{"file": "a.npy", "timestamp_us": 1}], "$[0]: Object missing required field `sensor_to_w"),
-    "time": ([entry(timestamp_us=1.5)], "$[0].timestamp_us: got 1.5, expected int"),
     "far time": ([entry(timestamp_us=10**400)], f"$[0].timestamp_us: got 1{56 * '0'}..., expected int <= 9223"),
     "far place": ([entry(sensor_to_world=[[10**400, 0, 0, 0], *EYE[1:]])], ".sensor_to_world[0][0]: Number out"),
-    "too far": (
-        [entry(sensor_to_world=[[1, 0, 0, -2e8], *EYE[1:]])],
-        "$[0].sensor_to_world[0][3]: got -200000000.0, expected float >= -100000000.0",
-    ),
+    "too far": ([entry(sensor_to_world=[[1, 0, 0, -2e8], *EYE[1:]])], "_world[0][3]: got -200000000.0, expected"),
     "NaN": ([entry(sensor_to_world=[[np.nan, 0, 0, 0], *EYE[1:]])], "[0].sensor_to_world[0][0]: got nan, exp"),
     "last row": ([entry(sensor_to_world=[*EYE[:3], [1, 1, 1, 1]])], "$[0].sensor_to_world: got [[1.0, 0.0, 0."),
-    "scaled": ([entry(sensor_to_world=np.diag([2, 2, 2, 1.0]).tolist())], "expected a rotation in the upper left"),
     "mirrored": ([entry(sensor_to_world=np.diag([-1, 1, 1, 1.0]).tolist())], "expected a rotation in the upper"),
-    "oldest first": (
-        [entry(timestamp_us=9), entry(timestamp_us=1), entry(timestamp_us=8)],
-        "$[2].timestamp_us: got 8, expected less than 1 of the entry before: the current sweep first, then by",
-    ),
+    "oldest first": ([entry(timestamp_us=t) for t in (9, 1, 8)], "$[2].timestamp_us: got 8, expected less than 1"),
     "twice": ([entry(timestamp_us=9), *2 * [entry(timestamp_us=1)]], "$[2].timestamp_us: got 1, expected less"),
     "nanoseconds": ([entry(timestamp_us=50 * 10**6 + 1), entry()], "timestamp_us: got 5e+07 on average, exp"),
     "milliseconds": ([entry(timestamp_us=51), entry()], "timestamp_us: got 50 on average, exp"),

@@ -18,7 +18,7 @@ import pytest
 from fcos_lidar_jax.input_pipeline.open import Format
 
 from .mutators import mutate
-from .targets import NAMES, InvalidError, Target, make_targets, plain_name
+from .targets import NAMES, Target, make_targets
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
 MEMORY_MIB, SECONDS = 512, 10  # that one input may take
@@ -56,7 +56,7 @@ def write_files(target: Target, folder: Path) -> None:
 def is_accepted(target: Target, folder: Path, seed: int) -> bool:
     """Whether the reader accepts a changed file; a refusal must be one short line that names the file."""
     rng = Random(f"{target.name} {seed}")
-    name = rng.choice(target.mutable)
+    name = rng.choice(list(target.files))
     write_files(target, folder)
     (folder / name).write_bytes(mutate(name, target.files[name], rng))
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
@@ -68,8 +68,6 @@ def is_accepted(target: Target, folder: Path, seed: int) -> bool:
         assert message.splitlines() == [message]
         assert len(message) <= LONGEST_MESSAGE + message.count(where) * len(where)
         return False
-    except InvalidError as error:
-        raise AssertionError(f"accepted: {error}") from error
     return True
 
 
@@ -90,11 +88,12 @@ def test_a_changed_file_is_refused_in_one_line_or_gives_valid_data(name, targets
 
 def test_every_format_is_tried(targets):
     assert tuple(targets) == NAMES
-    assert set(get_args(Format)) - set(map(plain_name, NAMES)) == {"simulated"}
+    formats = {name.lower().replace(" ", "") for name in NAMES}
+    assert set(get_args(Format)) - formats == {"simulated"}
 
 
 def test_the_targets_accept_their_own_files(targets, tmp_path):
     for target in targets.values():
         write_files(target, folder := tmp_path / re.sub(r"\W", "_", target.name))
-        for name in target.mutable:
+        for name in target.files:
             target.read(folder, name)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.nuscenes import tables as kinds
 from fcos_lidar_jax.data.nuscenes.index import Index
 from fcos_lidar_jax.data.nuscenes.tables import R, Row, read_table
@@ -17,7 +16,6 @@ CHANNEL = "LIDAR_TOP"  # the only sensor that is kept
 Report = Callable[[str, int], None]  # called with the file and the number of rows read so far
 
 Columns = dict[str, np.ndarray]
-_DANGLING = -2  # row number for a token that no row has
 
 
 class _Tables:
@@ -43,11 +41,14 @@ class _Tables:
             numbers[row.token] = len(numbers)
         return numbers
 
-    def find(self, numbers: dict[str, int], row: Row, field: str, token: str | None = None) -> int:
+    def find(self, numbers: dict[str, int], row: Row, field: str) -> int:
         """The number of the row to which a field's token refers."""
-        target: str = getattr(row, field) if token is None else token
+        return self.look_up(numbers, type(row), row.token, field, getattr(row, field))
+
+    def look_up(self, numbers: dict[str, int], kind: type[Row], token: str, field: str, target: str) -> int:
+        """The number of the row to which the token ``target`` refers; it is in a field of the row ``token``."""
         if target not in numbers:
-            raise self.error(type(row), row.token, _dangling(field, target))
+            raise self.error(kind, token, f"{field}: got {target!r}, expected the token of an existing record")
         return numbers[target]
 
     def find_all(self, numbers: dict[str, int], rows: list[R], field: str, dtype: type) -> np.ndarray:
@@ -66,13 +67,13 @@ class _Tables:
         return ValueError(f"{self.place(kind, token)}: {problem}")
 
 
-def _dangling(field: str, token: str) -> str:
-    return f"{field}: got {token!r}, expected the token of an existing record"
-
-
 def _floats(rows: list[Any], **widths: int) -> Columns:
     columns = {field: np.array([getattr(row, field) for row in rows], np.float64) for field in widths}
     return {field: column.reshape(-1, widths[field]) for field, column in columns.items()}
+
+
+def _joined(parts: list[Columns]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def build_index(folder: str | Path, report: Report = lambda name, rows: None) -> Index:
@@ -104,8 +105,8 @@ def _sweeps(tables: _Tables, samples: dict[str, int]) -> Columns:
     """The LiDAR's sweeps with their poses, each linked to the sweep before it."""
     sensors, sensor_numbers = tables.read(kinds.SensorRow)
     mounts, mount_numbers = tables.read(kinds.CalibratedSensor)
-    channels = [sensors[tables.find(sensor_numbers, mount, "sensor_token")].channel for mount in mounts]
-    mounts = [mount for mount, channel in zip(mounts, channels, strict=True) if channel == CHANNEL]
+    sensor_of = tables.find_all(sensor_numbers, mounts, "sensor_token", np.int32)
+    mounts = [mount for mount, i in zip(mounts, sensor_of, strict=True) if sensors[i].channel == CHANNEL]
     lidars = {mount.token: i for i, mount in enumerate(mounts)}
     rows: list[kinds.SampleData] = []
     for piece in tables.pieces(kinds.SampleData):
@@ -151,19 +152,16 @@ def _check_path(tables: _Tables, row: kinds.SampleData) -> None:
 
 def _ego_poses(tables: _Tables, rows: list[kinds.SampleData]) -> Columns:
     """The poses of the LiDAR's sweeps; poses of other sensors are skipped."""
-    numbers: dict[str, int] = {}
-    order = [numbers.setdefault(row.ego_pose_token, len(numbers)) for row in rows]
-    rotation, translation = np.full((len(numbers), 4), np.nan), np.full((len(numbers), 3), np.nan)
+    wanted = {row.ego_pose_token for row in rows}
+    parts, numbers = list[Columns](), dict[str, int]()
     for piece in tables.pieces(kinds.EgoPose):
-        for pose in piece:
-            if (i := numbers.get(pose.token)) is not None:
-                rotation[i], translation[i] = pose.rotation, pose.translation
-    for row, i in zip(rows, order, strict=True):
-        if np.isnan(rotation[i, 0]):
-            raise tables.error(kinds.SampleData, row.token, _dangling("ego_pose_token", row.ego_pose_token))
-    columns = {"rotation": rotation, "translation": translation}
+        poses = [pose for pose in piece if pose.token in wanted]
+        tables.number(poses, numbers)
+        parts.append(_floats(poses, rotation=4, translation=3))
+    columns = _joined(parts)
     tables.normalise_poses(kinds.EgoPose, list(numbers), columns)
-    return {name: column[np.array(order, np.int64)] for name, column in columns.items()}
+    order = tables.find_all(numbers, rows, "ego_pose_token", np.int64)
+    return {name: column[order] for name, column in columns.items()}
 
 
 def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray) -> Columns:
@@ -176,8 +174,10 @@ def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray)
     links: dict[str, list[str]] = {"prev": [], "next": []}
 
     def attribute_of(row: kinds.SampleAnnotation) -> int:
-        tokens = row.attribute_tokens
-        return tables.find(attribute_numbers, row, "attribute_tokens", tokens[0]) if tokens else -1
+        if not row.attribute_tokens:
+            return -1
+        first = row.attribute_tokens[0]
+        return tables.look_up(attribute_numbers, type(row), row.token, "attribute_tokens", first)
 
     for piece in tables.pieces(kinds.SampleAnnotation):
         tables.number(piece, numbers)
@@ -194,18 +194,16 @@ def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray)
                 "radar_points": np.array([row.num_radar_pts for row in piece], np.int32),
             }
         )
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    tokens = list(numbers)
-    size = columns["size"]
-    for i in np.flatnonzero(~((size <= LIMITS["l"]) & (size > 0)).all(axis=1)):
-        problem = f"size: got {size[i].tolist()}, expected three positive lengths of at most {LIMITS['l']:g} m"
-        raise tables.error(kinds.SampleAnnotation, tokens[i], problem)
+    columns, tokens = _joined(parts), list(numbers)
     tables.normalise_poses(kinds.SampleAnnotation, tokens, columns)
-    neighbours = []
-    for field, linked in links.items():
-        neighbours.append(np.array([numbers.get(token, _DANGLING) if token else -1 for token in linked], np.int64))
-        for i in np.flatnonzero(neighbours[-1] == _DANGLING):
-            raise tables.error(kinds.SampleAnnotation, tokens[i], _dangling(field, linked[i]))
+
+    def neighbour(own: str, field: str, other: str) -> int:
+        return tables.look_up(numbers, kinds.SampleAnnotation, own, field, other) if other else -1
+
+    neighbours = [
+        np.array([neighbour(own, field, other) for own, other in zip(tokens, linked, strict=True)], np.int64)
+        for field, linked in links.items()
+    ]
     sample = columns.pop("sample")
     columns["velocity"] = velocities(columns["translation"], sample_time_us[sample], *neighbours)
     order = np.argsort(sample, kind="stable")

@@ -109,7 +109,7 @@ class NuScenes:
         return tokens
 
     def scene_of(self, sample_token: str) -> str:
-        return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
+        return str(self.index.scene_name[self.index.sample_scene[self._sample_row[sample_token]]])
 
     def sweeps(self, sample_token: str, num: int = 10) -> np.ndarray:
         """The latest ``num`` sweeps up to a keyframe, fused in its LiDAR frame like in the official devkit.
@@ -200,7 +200,7 @@ class NuScenes:
 
     def annotations(self, sample_token: str) -> slice:
         """Rows of a keyframe's annotations of all categories in the index."""
-        first, last = self.index.sample_first[self._row(sample_token) :][:2]
+        first, last = self.index.sample_first[self._sample_row[sample_token] :][:2]
         return slice(int(first), int(last))
 
     def missing_sweeps(self, sample_tokens: list[str], num: int = 10) -> int:
@@ -258,13 +258,8 @@ class NuScenes:
         """f64[3]: position of the ego vehicle in the global frame."""
         return self.index.ego_translation[self._sweep(sample_token)]
 
-    def _row(self, sample_token: str) -> int:
-        if sample_token not in self._sample_row:
-            raise ValueError(f"{self.tables / 'sample.json'}: {sample_token!r}: no such token")
-        return self._sample_row[sample_token]
-
     def _sweep(self, sample_token: str) -> int:
-        return int(self.index.sample_sweep[self._row(sample_token)])
+        return int(self.index.sample_sweep[self._sample_row[sample_token]])
 
     def _chain(self, row: int, num: int) -> list[int]:
         """A sweep and the sweeps before it, at most ``num``."""
@@ -300,10 +295,9 @@ class NuScenes:
     def _read(self, row: int) -> Sweep:
         path = self._expect_file(row)
         size = path.stat().st_size
-        if size == 0 or size % (4 * _COLUMNS) or size > 4 * _COLUMNS * MAX_POINTS:
-            found = "an empty file" if size == 0 else f"{size} bytes"
-            expected = f"a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_POINTS} points"
-            raise ValueError(f"{path}: got {found}, expected {expected}")
+        if size % (4 * _COLUMNS) or not 0 < size <= 4 * _COLUMNS * MAX_POINTS:
+            expected = f"a multiple of {4 * _COLUMNS} (float32 x 5), 1 to {MAX_POINTS} points"
+            raise ValueError(f"{path}: got {size} bytes, expected {expected}")
         points = np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
         return Sweep(points, self._sensor_to_global(row), int(self.index.sweep_time_us[row]), str(path))
 

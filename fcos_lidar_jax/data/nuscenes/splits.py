@@ -25,7 +25,7 @@ def scenes_of_split(
 ) -> list[str]:
     """Scene names of a split in the given file, else in the version's ``splits.json``, else of an official split.
 
-    An unknown split, one without scenes, and scenes that are not ``known`` are refused.
+    An unknown split and scenes that are not ``known`` are refused.
     """
     path, splits = Path(file or Path(tables) / SPLITS), own_splits(Path(tables), file)
     hint = "you can pass a file {name: [scene, ...]}"
@@ -34,8 +34,6 @@ def scenes_of_split(
     if split not in splits:
         names = ", ".join(splits or official_splits())
         raise ValueError(f"split {split!r}: not found in {path}, expected one of {names}; {hint}")
-    if not splits[split]:
-        raise ValueError(f"{path}: {split}: got no scene, expected at least one")
     for scene in splits[split]:
         if scene not in known:
             raise ValueError(f"split {split!r}: {scene}: no such scene in {Path(tables) / 'scene.json'}; {hint}")

@@ -13,7 +13,10 @@ from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
+from fcos_lidar_jax.data.box_geometry import LIMITS
+
 _Count = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
+_Length = Annotated[float, msgspec.Meta(gt=0, le=LIMITS["l"])]  # metres
 _Time = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]  # microseconds
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
@@ -110,7 +113,7 @@ class SampleAnnotation(Row):
     instance_token: str
     attribute_tokens: tuple[str, ...]
     translation: Vector
-    size: Vector
+    size: tuple[_Length, _Length, _Length]
     rotation: Quaternion
     prev: str
     next: str
