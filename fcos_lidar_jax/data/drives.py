@@ -223,6 +223,8 @@ def read_tum(path: Path) -> PoseTrack:
         places.append(where)
         times.append(round(Decimal(words[0]) * 1_000_000))  # a float cannot represent today's microseconds
         rows.append((scalar, *vector, x, y, z))
+    if not rows:
+        raise ValueError(f"{path}: no pose in it, expected lines t x y z qx qy qz qw")
     track = make_track(times, rows, places.__getitem__)
     w, x, y, z = track.rotations.T
     if len(inverted := np.flatnonzero(x * x + y * y > w * w + z * z)):
