@@ -1,5 +1,6 @@
 """Evaluation of frames of any data set: boxes in the sensor's frame, without tokens, racks and attributes."""
 
+import dataclasses
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -28,10 +29,7 @@ def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric
         found: NumPy detections per frame, with labels by the metric's classes.
         frames: frames with ground truth, with labels by the metric's classes; boxes without points are not
             evaluated. The points of the frames are not used.
-        metric: from :func:`fcos_lidar_jax.evaluation.metrics.metric_of`.
-
-    Raises:
-        ValueError: the metric is the benchmark's.
+        metric: classes and ranges, from :func:`fcos_lidar_jax.evaluation.metrics.metric_of`.
 
     >>> from fcos_lidar_jax.evaluation.metrics import metric_of
     >>> frame = Frame(np.zeros((0, 5)), np.ones((1, 9)), np.zeros(1, int), np.ones(1, int))
@@ -39,9 +37,7 @@ def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric
     >>> round(evaluate_frames([exact], [frame], metric_of(["car", "tram"])).summary["mean_ap"], 9)
     1.0
     """
-    if metric.benchmark:
-        raise ValueError("metric: got the nuScenes benchmark's, expected metric_of(...): frames lack attributes")
-    return evaluate(*frame_columns(found, frames), metric)
+    return evaluate(*frame_columns(found, frames), dataclasses.replace(metric, benchmark=False))
 
 
 def frame_columns(

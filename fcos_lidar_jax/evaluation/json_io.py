@@ -66,9 +66,10 @@ def decode_json(text: Text, kind: Any, source: str) -> Any:
         except msgspec.DecodeError:
             return msgspec.json.decode(_plain_json(text), type=kind, dec_hook=_make)
     except msgspec.ValidationError as error:
-        raise ValueError(f"{source}: {_explain(error)}") from None
+        problem = _explain(error)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{source}: not JSON: {error}") from None
+        problem = f"not JSON: {error}"
+    raise ValueError(f"{source}: {problem}")
 
 
 def _make(kind: Any, value: Any) -> Any:

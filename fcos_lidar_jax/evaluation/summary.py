@@ -152,5 +152,6 @@ def _beyond_range(truth: GroundTruth, metric: Metric) -> list[str]:
     labels = np.unique(truth.boxes.label[far])
     if not len(labels):
         return []
-    ranges = ", ".join(f"{metric.classes[label]} {metric.class_ranges_m[label]:g} m" for label in labels)
+    names = [metric.classes[label] for label in labels]
+    ranges = ", ".join(f"{name} {metric.ranges_m[name]:g} m" for name in names)
     return [f"{far.sum()} boxes of the truth are beyond the range of their class and are not evaluated: {ranges}"]

@@ -14,7 +14,7 @@ from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
 from fcos_lidar_jax.evaluation.frames import evaluate_frames, frame_columns, read_detections, write_detections
-from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, evaluate, metric_of
+from fcos_lidar_jax.evaluation.metrics import evaluate, metric_of
 from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
 from fcos_lidar_jax.sensors import TINY
@@ -100,18 +100,6 @@ def test_truth_that_is_not_evaluated_is_reported():
         lines = warnings(evaluation, 1, truth)[:-1]  # the last one is about the detections
         assert len(lines) == len(expected)
         assert all(map(re.match, expected, lines))
-
-
-def test_invalid_metrics_are_rejected():
-    for classes, ranges, message in (
-        ((), (), "classes: got .*expected at least one name"),
-        (("a", "b", "a"), (), "classes: got .*each once"),
-        (("a", "b"), (1.0,), "class_ranges_m: got .*expected 2 positive lengths"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            metric_of(classes, ranges)
-    with pytest.raises(ValueError, match="metric: got the nuScenes benchmark's"):
-        evaluate_frames([], [], NUSCENES_METRIC)
 
 
 def test_without_truth_there_is_no_score_and_intervals_stay_defined(tmp_path):
