@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
+from fcos_lidar_jax.inference.tracks import Tracks, track
 
 
 def objects(seed, number=60):
@@ -74,17 +74,3 @@ def test_a_track_continues_with_near_boxes_of_its_class_after_a_short_time(dt, s
     tracks, _ = track(Tracks(), box, np.zeros(1, int), np.ones(1), 0)
     box[0, 0] += shift
     assert track(tracks, box, np.full(1, label), np.ones(1), dt)[1].tolist() == [track_id]
-
-
-def test_positions_headings_and_velocities_are_transformed_to_the_world():
-    rng, angle = np.random.default_rng(0), 0.7
-    boxes = rng.normal(0, 10, (20, 9))
-    pose = np.eye(4)
-    pose[:2, :2], pose[:3, 3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], (5, -3, 1)
-    world = to_world(boxes, pose)
-    for before, after in zip(boxes, world, strict=True):
-        for reach in (0.0, 1.0):  # the centre, and a point ahead of it
-            point = before[:3] + reach * np.array([np.cos(before[6]), np.sin(before[6]), 0])
-            there = after[:3] + reach * np.array([np.cos(after[6]), np.sin(after[6]), 0])
-            np.testing.assert_allclose((pose @ [*point, 1])[:3], there, atol=1e-12)
-        np.testing.assert_allclose(pose[:3, :3] @ [*before[7:9], 0], [*after[7:9], 0], atol=1e-12)
