@@ -41,13 +41,10 @@ BOXES = {
     "unknown class": ({"detection_name": "tram"}, r"detection_name: got 'tram', expected one of car, truck"),
     "infinite score": ({"detection_score": float("inf")}, "detection_score: expected `float`, got `str`"),
     "negative score": ({"detection_score": -0.5}, r"detection_score: got -0\.5, expected a finite number"),
-    "no score": ({"detection_score": "left out"}, "object missing required field `detection_score`"),
     "zero size": ({"size": [2, 0, 1]}, r"size: got \[2\.0, 0\.0, 1\.0\], expected three positive lengths"),
-    "two sizes": ({"size": [2, 4]}, "size: expected `array` of length 3$"),
     "NaN size": ({"size": [2, float("nan"), 1]}, r"size\[1\]: expected `float`, got null or NaN"),
     "far away": ({"translation": [1e300, 0, 0]}, r"translation: got .*, expected numbers of at most 1e\+08"),
     "vanishing quaternion": ({"rotation": [1e-200, 0, 0, 0]}, "rotation: got .*, expected a nonzero quaternion"),
-    "infinite velocity": ({"velocity": [1, float("-inf")]}, r"velocity\[1\]: expected `float \| null`, got `str`"),
     "fast": ({"attribute_name": "fast"}, "attribute_name: got 'fast', expected one of cycle.* or nothing"),
     "other sample": ({"token": "a"}, "sample_token: got 'a', expected 'b'"),
 }
@@ -69,14 +66,11 @@ FILES = {
     "501 boxes": (results_of("bc", a=[box("a")] * 501), "sample a: box 500: got 501 boxes, expected at most 500"),
     "twice": (b'{"meta": {}, "results": {"a": [], "b": [], "b" : []}}', "results: sample b: occurs twice"),
     "box a list": (results_of(a=[[]]), "sample a: box 0: expected `object`, got `array`"),
-    "no results": ({"meta": {}}, "object missing required field `results`"),
     "cut": (json.dumps(document()).encode()[:-9], "not JSON: .*truncated"),
     "too large": (spelt("detection_score", b"1e999"), "sample b: (box 1: detection_score: )?.*out of range"),
     "a broken letter": (spelt("detection_name", b'"x\xffz"'), "sample b: not JSON: "),
-    "a broken letter in a token": (b'{"meta": {}, "results": {"a\xff": []}}', "(results: )?not JSON: "),
     "nested in a box": (spelt("size", b"[" * 100_000 + b"]" * 100_000), "(sample b: )?not JSON: .*recursion"),
     "empty": (b"", "empty file"),
-    "a list": (b"[]", "expected `object`, got `array`"),
 }
 
 
@@ -88,12 +82,6 @@ def test_invalid_boxes_and_files_are_named_in_one_line(name, tmp_path):
     with pytest.raises(ValueError, match=rf"^{re.escape(str(file))}: {message}") as error:
         read_results(file, TOKENS, of="split 'val'")
     assert "\n" not in str(error.value)
-
-
-def test_missing_files_and_folders_are_rejected(tmp_path):
-    for file, message in ((tmp_path / "none.json", "no such file"), (tmp_path, "found a folder")):
-        with pytest.raises(ValueError, match=message):
-            read_results(file, TOKENS)
 
 
 def test_irregularities_are_accepted_with_a_warning(tmp_path):

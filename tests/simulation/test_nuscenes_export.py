@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import contents, in_use
+from commands import assert_one_line_error, contents, in_use
 from kills import killed_twice
 from scipy.spatial.transform import Rotation
 
@@ -43,13 +43,6 @@ def command(out: Path, *more: str) -> list[str]:
 def synthesize(out: Path, *more: str) -> Path:
     assert cli.main(command(out, *more)) == 0
     return out
-
-
-def refusal(capsys, out: Path, *more: str) -> str:
-    """Run a command that must fail and return its single line of output."""
-    assert cli.main(command(out, *more)) == 1
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line
 
 
 def tables(root: Path) -> dict[str, list[dict]]:
@@ -164,13 +157,13 @@ def test_folders_with_other_contents_are_refused(made, tmp_path, capsys):
     before = contents(made)
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
     for option, value in (("seed", 5), ("streets", "plain"), ("sensor", tmp_path / "near.json")):
-        line = refusal(capsys, made, f"--{option}", str(value))
-        assert f"{made}: found a data set begun with another {option}" in line
+        line = command(made, f"--{option}", str(value))
+        assert_one_line_error(capsys, line, f"{made}: found a data set begun with another {option}")
     own = tmp_path / "own"
     with in_use(own / ".synthesize"):
-        assert " is at work, expected no other process" in refusal(capsys, own)
+        assert_one_line_error(capsys, command(own), " is at work, expected no other process")
     (own / "thesis.txt").write_text("mine")
-    assert "found other files, expected an empty folder" in refusal(capsys, own)
+    assert_one_line_error(capsys, command(own), "found other files, expected an empty folder")
     assert (own / "thesis.txt").read_text() == "mine"
     moved = {"forward_rad": 0.0, "origin_m": [1, 0, 2], "limit_z_m": [-3, 5]}  # the layout's own are written
     (tmp_path / "moved.json").write_text(json.dumps({**sensor_to_json(TINY), **moved}))
