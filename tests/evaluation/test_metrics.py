@@ -78,11 +78,6 @@ def cars(*rows):
         # The matching distance is exclusive.
         ([0], [(2.0, 0.9)], 0.0),
         ([0], [(np.nextafter(2.0, 0), 0.9)], 1.0),
-        # Of two boxes on one truth, the second is a false positive at full recall.
-        ([0], [(0, 0.9), (0.1, 0.8)], (89 * 0.9 + 0.4) / 90 / 0.9),
-        # The later box wins among equal scores.
-        ([0], [(9, 0.5), (0, 0.5)], (89 * 0.9 + 0.4) / 90 / 0.9),
-        ([0], [(0, 0.5), (9, 0.5)], sum(max(r / 200 - 0.1, 0) for r in range(11, 101)) / 90 / 0.9),
     ],
 )
 def test_single_class_values(truth, found, expected):

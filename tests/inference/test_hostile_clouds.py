@@ -36,12 +36,6 @@ def on_a_beam(rng, sensor, number):
     return with_columns(rng, sensor, beside(rng, xyz.astype(np.float32)) + sensor.origin_m)
 
 
-def on_the_limits(rng, sensor, number):
-    xy = rng.choice([-1, -0.5, 0, 0.1, 1], (number, 2)) * sensor.limit_xy_m
-    xyz = np.column_stack([xy, rng.choice([*sensor.limit_z_m, 0.0, -1.7], number)]).astype(np.float32)
-    return with_columns(rng, sensor, beside(rng, xyz))
-
-
 def one_point(rng, sensor, number):
     return np.repeat(anywhere(rng, sensor, 1), number, axis=0)
 
@@ -64,7 +58,7 @@ def with_columns(rng, sensor, xyz):
     return np.column_stack([xyz, *more])
 
 
-KINDS = (anywhere, on_a_beam, on_the_limits, one_point, extreme)
+KINDS = (anywhere, on_a_beam, one_point, extreme)
 
 
 def make_points(rng, sensor, number):

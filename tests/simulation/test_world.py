@@ -6,7 +6,6 @@ import itertools
 import numpy as np
 import oracles
 import pytest
-import shapely
 from numpy.random import default_rng
 from scipy.integrate import cumulative_trapezoid
 from shapely import STRtree
@@ -20,7 +19,7 @@ from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, trave
 from fcos_lidar_jax.simulation.nuscenes_tables import attribute_of, visibility_of
 from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_size
 from fcos_lidar_jax.simulation.solids import BOX, SOLID, corners, make_solids
-from fcos_lidar_jax.simulation.traffic import EGO_MIDDLE_M, EGO_SIZE_M, Traffic, _Occupancy
+from fcos_lidar_jax.simulation.traffic import EGO_MIDDLE_M, EGO_SIZE_M, Traffic
 from fcos_lidar_jax.simulation.world import World, sample_labels, sample_world
 
 FLAT = Ground(np.zeros((1, 3)), 300, 900, 7, 0.0, 3, (0.3, 0.3, 0.3))
@@ -59,35 +58,6 @@ def test_the_shortcut_for_straight_motions_is_bit_identical():
     for name in ("still", "straight", "braking to rest", "starting"):
         both = np.concatenate([MOTIONS[name], MOTIONS["left"]])[:, None]
         np.testing.assert_array_equal(pose_at(MOTIONS[name], times), pose_at(both, times)[0], err_msg=name)
-
-
-def test_room_for_objects_matches_shapely():
-    rng, times, clearance = default_rng(0), np.linspace(0, 1, 6), 0.3
-
-    def moving(number):
-        start = np.concatenate([rng.uniform(-15, 15, (number, 2)), rng.uniform(-4, 4, (number, 1))], axis=1)
-        poses = start[:, None] + times[:, None] * rng.uniform(-8, 8, (number, 1, 3))
-        return poses, rng.uniform(0.5, 6, (number, 3))
-
-    def shapes(poses, sizes):
-        boxes = np.zeros((*poses.shape[:2], 7))
-        boxes[..., [0, 1, 6]], boxes[..., 3:5] = poses, sizes[:, None, :2]
-        return oracles.rectangles(boxes.reshape(-1, 7)).reshape(poses.shape[:2])
-
-    (standing, sizes), (added, added_sizes) = moving(4), moving(4)
-    occupied = np.concatenate([standing[:, 0, :2], sizes[:, :2], standing[:, 0, 2:]], axis=1)
-    occupancy = _Occupancy(times, occupied)
-    for poses, size in zip(added, added_sizes, strict=True):
-        occupancy.add(poses, size)
-    stay = np.repeat(standing[:, :1], len(times), axis=1)
-    there = np.concatenate([shapes(stay, sizes), shapes(added, added_sizes)])
-    found = []
-    for pose, size in zip(*moving(500), strict=True):
-        distance = shapely.distance(shapes(pose[None], size[None]), there).min()
-        if distance == 0 or distance > np.sqrt(2) * clearance:  # between these limits it depends on the corners
-            found.append(occupancy.has_room(pose, size, clearance))
-            assert found[-1] == (distance > 0), distance
-    assert 50 < np.sum(found) < len(found) - 50
 
 
 @pytest.fixture(scope="module")
