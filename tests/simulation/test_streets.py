@@ -43,6 +43,10 @@ FRAMES = {  # sensor, options; seed, number of points, objects by label, mean x,
         (2, 6256, [5, 4, 4, 0, 2, 0, 0, 0, 1, 6], (1.06828, 8.18378, -0.45203, 22.04748)),
         (3, 6136, [4, 5, 1, 1, 1, 0, 1, 0, 0, 4], (-0.72841, 9.41445, -0.28606, 14.13429)),
     ),
+    "a sector across the end of the turn": (
+        *(sector(SENSOR, -3.0, 272), {"streets": CITY}),
+        (0, 6695, [3, 0, 0, 0, 0, 0, 0, 0, 0, 0], (-13.45164, -2.24581, -0.91406, 12.57625)),
+    ),
     "large offsets of the lasers": (
         *(QUARTER, {"streets": dataclasses.replace(CITY, ring_range_m=0.2)}),
         (0, 4794, [1, 0, 0, 0, 0, 0, 0, 0, 0, 0], (0.41177, 12.20327, -0.99364, 14.79683)),

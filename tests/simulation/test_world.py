@@ -11,7 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from shapely import STRtree
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.sensors import TINY, Sensor, even_inclinations, sector
+from fcos_lidar_jax.sensors import TINY, Sensor, even_inclinations
 from fcos_lidar_jax.simulation.frames import scan_sweeps
 from fcos_lidar_jax.simulation.ground import Ground
 from fcos_lidar_jax.simulation.lidar import SWEEP_S, Scan, sample_mount, scan
@@ -183,25 +183,6 @@ def test_fused_sweeps_align_static_objects_and_trail_behind_moving_objects():
     assert off[-1] > 4  # metres; shows the effect of the poses
 
 
-@pytest.mark.parametrize("speed", [0.0, 10.0])
-def test_a_rolling_shutter_shifts_only_moving_objects(speed):
-    starts = (-12, 0, 12)
-    world = made_by_hand(make_motion(speed=speed), [(x, -9.0, 12.0, (4, 2, 3)) for x in starts], WALL)
-    found, pose = [], world.ego_pose(1.0) @ LEVEL
-    for rolling in (False, True):
-        sweep = scan_fine(world, 1.0, 5, rolling_shutter=rolling)
-        points = sweep.points[sweep.returned, :3].astype(float) @ pose[:3, :3].T + pose[:3, 3]
-        assert_wall_is_sharp(points)
-        objects = points[(points[:, 1] < -7) & (points[:, 2] > 0.5)]
-        found.append([objects[np.abs(objects[:, 0] - x - 12) < 4, 0].mean() for x in starts])
-    still, rolled = np.array(found)
-    shift = still - rolled  # shift of the objects in metres when the beam passes
-    assert ((shift > -0.05) & (shift < 12 * SWEEP_S + 0.05)).all(), shift
-    assert np.ptp(shift) > 0.05  # the beam passes the objects one after another
-    if speed == 0:
-        assert shift.max() > 0.1
-
-
 def test_the_seen_share_is_the_share_of_unblocked_rays():
     objects = [(20, 0, 0, (0.2, 8, 3)), (10, 1, 0, (0.2, 2, 3)), (-15, 0, 0, (2, 2, 2))]
     world = made_by_hand(make_motion(), objects)
@@ -226,18 +207,3 @@ def test_points_without_return_surround_the_sensor_and_points_have_laser_numbers
     slope = np.arctan2(back[:, 2], np.hypot(back[:, 0], back[:, 1]))
     expected = np.array(TINY.inclinations_rad)[::-1][back[:, 4].astype(int)]
     np.testing.assert_allclose(slope, expected, atol=1e-4)
-
-
-@pytest.mark.parametrize("middle", [np.pi / 2, -3.0])
-def test_a_sector_is_scanned_at_its_part_of_the_turn(middle):
-    part = sector(TINY, middle, 64)
-    world, mount = made_by_hand(make_motion()), sample_mount(default_rng(0), TINY, level=True)
-    found, whole = (
-        scan(world, sensor, mount, 0.0, default_rng(0), rolling_shutter=True) for sensor in (part, TINY)
-    )
-    assert found.points.shape == (TINY.num_rows * 64, 5)
-    back = found.points[found.returned]
-    behind = (part.first_azimuth_rad - np.arctan2(back[:, 1], back[:, 0]) + 0.1) % (2 * np.pi)
-    assert behind.max() < 0.1 + (64 + 3) * part.column_rad
-    assert len(back) > 400
-    assert len(whole.points) == 4 * len(found.points)
