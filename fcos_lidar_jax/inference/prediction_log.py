@@ -65,8 +65,7 @@ def write_predictions(
             same, names = (how.get("batch_size", 1), how.get("yaw_rad")), [*map(frames.name, range(len(frames)))]
             frames.check_files(range(len(names)))
             if jax.process_index() == 0:
-                inputs = frames.fingerprint(), sensor_to_json(frames.sensor), *same, options
-                log = held.enter_context(_open_log(path, detections_fingerprint(detector, *inputs)))
+                log = held.enter_context(_open_log(path, _fingerprint(detector, frames, *same, options)))
                 finished = _Finished(log, frames, names, unit)
         check_same(detections_fingerprint(detector, names, *same), "detector, frames or batch size")
         todo = np.ones(len(names), bool) if finished is None else finished.todo
@@ -160,3 +159,7 @@ def detections_fingerprint(detector: CloudDetector, *others: object) -> str:
     """Checksum of everything detections depend on: weights, configuration, sensor, and other values, as JSON."""
     inputs = detector.fingerprint, config_to_json(detector.config), sensor_to_json(detector.sensor), *others
     return checksum(json.dumps(inputs, sort_keys=True).encode())
+
+
+def _fingerprint(detector: CloudDetector, frames: FrameSet, *how: object) -> str:
+    return detections_fingerprint(detector, frames.fingerprint(), sensor_to_json(frames.sensor), *how)

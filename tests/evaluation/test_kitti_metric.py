@@ -180,13 +180,6 @@ def test_image_boxes_and_orientation(tmp_path, case):
         assert scores["bev"] == scores["3d"] == all_of(100 * 50 / 51)
 
 
-def test_the_last_true_positive_is_a_threshold_anyhow(tmp_path):
-    """Of 80 objects, every second one is a position; the one after the last position is averaged, too."""
-    for number, percent in ((2, 2.5), (3, 5.0), (4, 5.0), (5, 7.5), (40, 50.0), (80, 100.0)):
-        found = [line(x=6.0 * i, score=0.8 - i / 1000) for i in range(number)]
-        assert ap(tmp_path, street(number=80), found) == all_of(percent)
-
-
 FLAT = "Car -1 -1 -10 100 100 150 150 -1 -1 -1 -1000 -1000 -1000 -10 0.9\n"
 """A detection in the image only."""
 
