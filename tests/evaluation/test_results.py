@@ -69,7 +69,7 @@ FILES = {
     "too large": (spelt("detection_score", b"1e999"), "sample b: (box 1: detection_score: )?.*out of range"),
     "a broken letter": (spelt("detection_name", b'"x\xffz"'), "sample b: not JSON: "),
     "nested in a box": (spelt("size", b"[" * 100_000 + b"]" * 100_000), "(sample b: )?not JSON: .*recursion"),
-    "empty": (b"", "empty file"),
+    "empty": (b"", "not JSON: .*truncated"),
 }
 
 
