@@ -10,7 +10,7 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
 from fcos_lidar_jax.evaluation.frames import frame_columns, read_detections, write_detections
-from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Metric, metric_of
+from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Metric
 from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
 from fcos_lidar_jax.types import Detections
@@ -73,7 +73,7 @@ def compare_by_distance(frames: FrameSet, ranges_m: dict[str, float]) -> Compari
 
     return Comparison(
         RESULT_FILES[1],
-        metric_of(classes, tuple(ranges_m.values())),
+        Metric(ranges_m),
         lambda _, detections: as_records(detections, classes),
         partial(write_detections, classes=classes),
         read,

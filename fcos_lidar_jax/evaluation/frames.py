@@ -111,16 +111,9 @@ def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) ->
         expect(near, boxes, "box", where, f"numbers of at most {FARTHEST_M:g}")
         positive = (columns[:, 3:6] >= np.finfo(np.float32).tiny).all(axis=1)
         expect(positive, boxes, "box", where, "three positive sizes")
-        unknown = np.isnan(columns[:, 7:])
-        expect(unknown[:, 0] == unknown[:, 1], boxes, "box", where, "a velocity of two numbers or of two nulls")
         scores = np.array([box.score for box in boxes])
         expect((scores >= 0) & (scores <= FARTHEST_M), boxes, "score", where, "a number of at least 0")
-        arrays: Any = (
-            columns.astype(np.float32),
-            scores.astype(np.float32),
-            labels.astype(np.int32),
-            np.ones(len(boxes), bool),
-            np.int32(0),
-        )
-        found.append(Detections(*arrays))
+        arrays: Any = columns.astype(np.float32), scores.astype(np.float32), labels.astype(np.int32)
+        rest: Any = {"valid": np.ones(len(boxes), bool), "num_dropped": np.int32(0)}
+        found.append(Detections(*arrays, **rest))
     return found

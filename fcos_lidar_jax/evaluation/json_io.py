@@ -46,10 +46,10 @@ def read_source(source: str | Path | dict[str, Any], kind: Any, *, given: str = 
         return decode_json(text, kind, given), given
     path = Path(source)
     expect_file(path, "a JSON file")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path}: empty file, expected JSON")
     with path.open("rb") as stream:
-        return decode_json(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), kind, str(path)), str(path)
+        is_empty = path.stat().st_size == 0  # which cannot be mapped
+        text = b"" if is_empty else mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        return decode_json(text, kind, str(path)), str(path)
 
 
 def decode_json(text: Text, kind: Any, source: str) -> Any:
@@ -66,9 +66,10 @@ def decode_json(text: Text, kind: Any, source: str) -> Any:
         except msgspec.DecodeError:
             return msgspec.json.decode(_plain_json(text), type=kind, dec_hook=_make)
     except msgspec.ValidationError as error:
-        raise ValueError(f"{source}: {_explain(error)}") from None
+        problem = _explain(error)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{source}: not JSON: {error}") from None
+        problem = f"not JSON: {error}"
+    raise ValueError(f"{source}: {problem}")
 
 
 def _make(kind: Any, value: Any) -> Any:

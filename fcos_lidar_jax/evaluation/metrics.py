@@ -6,7 +6,7 @@
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,15 +33,16 @@ class Metric:
     Labels index ``classes``. A class with the name of a nuScenes class has the properties of that class.
     """
 
-    classes: tuple[str, ...]  # names of the classes
-    class_ranges_m: tuple[float, ...]  # range of each class; farther boxes are not evaluated
+    ranges_m: Mapping[str, float]  # range of each class; farther boxes are not evaluated
     benchmark: bool = False  # nuScenes benchmark, with NDS and attributes; without truth, AP is 0 and errors are 1
 
     def __post_init__(self) -> None:
-        number, ranges = len(self.classes), self.class_ranges_m
-        check(len(set(self.classes)) == number > 0, "classes", self.classes, "at least one name, each once")
-        positive = len(ranges) == number and all(r > 0 for r in ranges)
-        check(positive, "class_ranges_m", ranges, f"{number} positive lengths, one per class")
+        positive = len(self.ranges_m) > 0 and all(range_m > 0 for range_m in self.ranges_m.values())
+        check(positive, "ranges_m", self.ranges_m, "a positive length for each of at least one class")
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        return tuple(self.ranges_m)
 
     @property
     def heading_period_rad(self) -> np.ndarray:
@@ -53,7 +54,7 @@ class Metric:
     def settings(self) -> dict[str, Any]:
         """Settings as in the field ``cfg`` of ``metrics_summary.json``."""
         matching = {
-            "class_range": dict(zip(self.classes, self.class_ranges_m, strict=True)),
+            "class_range": dict(self.ranges_m),
             "dist_fcn": "center_distance",
             "dist_ths": list(DISTANCES_M),
             "dist_th_tp": DISTANCES_M[ERROR_ROW],
@@ -66,7 +67,7 @@ class Metric:
         return {"metric": "center_distance", "note": note, **matching}
 
 
-NUSCENES_METRIC = Metric(NUSCENES_CLASSES, tuple(int(RANGES_M[name]) for name in NUSCENES_CLASSES), benchmark=True)
+NUSCENES_METRIC = Metric({name: int(RANGES_M[name]) for name in NUSCENES_CLASSES}, benchmark=True)
 """The benchmark's metric, ``detection_cvpr_2019``; ranges are measured from the ego vehicle, not the sensor."""
 
 
@@ -76,10 +77,12 @@ def metric_of(classes: Sequence[str], class_ranges_m: Sequence[float] = ()) -> M
     The classes are in the order of the labels. By default, their ranges follow from their names, see
     ``classes.RANGES_M``.
 
-    >>> metric_of(["pedestrian", "forklift"]).class_ranges_m
-    (40.0, 50.0)
+    >>> metric_of(["pedestrian", "forklift"]).ranges_m
+    {'pedestrian': 40.0, 'forklift': 50.0}
     """
-    return Metric(tuple(classes), tuple(class_ranges_m or (RANGES_M.get(n, DEFAULT_RANGE_M) for n in classes)))
+    check(len({*classes}) == len(classes), "classes", classes, "different names")
+    ranges = class_ranges_m or [RANGES_M.get(name, DEFAULT_RANGE_M) for name in classes]
+    return Metric(dict(zip(classes, ranges, strict=True)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +142,7 @@ def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxCo
 def within_range(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> np.ndarray:
     """Whether boxes are nearer to ``truth.ego_translation`` than the range of their class, bool[n]."""
     offset = boxes.translation[:, :2] - truth.ego_translation[boxes.sample, :2]
-    return np.sqrt((offset**2).sum(axis=1)) < np.array(metric.class_ranges_m, float)[boxes.label]
+    return np.sqrt((offset**2).sum(axis=1)) < np.array([*metric.ranges_m.values()])[boxes.label]
 
 
 def class_curves(ranking: Ranking) -> Curves:

@@ -1,7 +1,7 @@
 """Files and text lines of an evaluation, including the official ``metrics_summary.json``."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +131,7 @@ def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None =
         rule = "AP 0 and errors 1, as in the benchmark" if benchmark else "excluded from the means"
         lines.append(f"no ground truth is evaluated for {', '.join(absent)}: {rule}")
     if truth is not None and not benchmark:
-        lines += [*_without_points(truth), *_beyond_range(truth, evaluation.metric)]
+        lines += _not_evaluated(truth, evaluation.metric)
     if not num_found:
         lines.append("the results contain no boxes: every AP is 0 and every error 1")
     elif not len(evaluation.predictions):
@@ -139,18 +139,13 @@ def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None =
     return lines
 
 
-def _without_points(truth: GroundTruth) -> list[str]:
-    empty, number = int((truth.boxes.num_points == 0).sum()), len(truth.boxes.label)
-    if not empty:
-        return []
-    cause = ": are points and boxes in the same frame?" if empty > number / 2 else ""
-    return [f"{empty} of {number} boxes of the truth contain no point and are not evaluated{cause}"]
-
-
-def _beyond_range(truth: GroundTruth, metric: Metric) -> list[str]:
-    far = ~within_range(truth.boxes, truth, metric) & (truth.boxes.num_points != 0)
-    labels = np.unique(truth.boxes.label[far])
-    if not len(labels):
-        return []
-    ranges = ", ".join(f"{metric.classes[label]} {metric.class_ranges_m[label]:g} m" for label in labels)
-    return [f"{far.sum()} boxes of the truth are beyond the range of their class and are not evaluated: {ranges}"]
+def _not_evaluated(truth: GroundTruth, metric: Metric) -> Iterator[str]:
+    empty, number = truth.boxes.num_points == 0, len(truth.boxes)
+    if empty.any():
+        cause = ": are points and boxes in the same frame?" if empty.mean() > 0.5 else ""
+        yield f"{empty.sum()} of {number} boxes of the truth contain no point and are not evaluated{cause}"
+    far = ~within_range(truth.boxes, truth, metric) & ~empty
+    if far.any():
+        names = [metric.classes[label] for label in np.unique(truth.boxes.label[far])]
+        ranges = ", ".join(f"{name} {metric.ranges_m[name]:g} m" for name in names)
+        yield f"{far.sum()} boxes of the truth are beyond the range of their class and are not evaluated: {ranges}"

@@ -31,8 +31,6 @@ def load_detector(checkpoint: str | Path, *, backend: Backend = "xla") -> CloudD
     check(backend in get_args(Backend), "backend", backend, f"one of {', '.join(get_args(Backend))}")
     path = find_checkpoint(Path(checkpoint))
     if backend == "openvino":
-        if path.is_file():
-            raise ValueError(f"backend openvino: {path}: found an exported program, expected a checkpoint")
         return with_openvino(load_trained(path))
     return load_exported(path) if path.is_file() else load_trained(path)
 

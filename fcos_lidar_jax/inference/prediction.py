@@ -10,7 +10,7 @@ from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.frame import Frame, FrameSet, check_frames, without_points
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
-from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
+from fcos_lidar_jax.evaluation.metrics import Evaluation, Metric
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.detector import CloudDetector
@@ -86,4 +86,4 @@ def evaluate(
         found.append(prediction.detections)
         if jax.process_index() == 0:
             progress.show(len(found))
-    return evaluate_frames(found, truths, metric_of(detector.classes, tuple(detector.config.ranges_m.values())))
+    return evaluate_frames(found, truths, Metric(detector.config.ranges_m))

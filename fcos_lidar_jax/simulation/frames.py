@@ -10,7 +10,7 @@ from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.simulation.lidar import SWEEP_S, sample_mount, scan, sensor_pose
+from fcos_lidar_jax.simulation.lidar import SWEEP_S, sample_mount, scan
 from fcos_lidar_jax.simulation.motion import velocity_at
 from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.world import World, class_shares, sample_world
@@ -53,7 +53,7 @@ def make_frame(
     world = sample_world(rng, reach_m=reach, beyond_m=2 * reach, duration_s=now_s, labels=labels, **options)
     mount = sample_mount(rng, sensor, level=not streets.slopes, streets=streets)
     points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, reading)
-    boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, now_s), now_s).astype(np.float32)
+    boxes = boxes_in_sensor_frame(world, world.ego_pose(now_s) @ mount, now_s).astype(np.float32)
     counts = count_inside(points[points[:, 4] == 0], boxes)
     visible = counts >= max(min_points, 1)
     return Frame(points, boxes[visible], world.traffic.labels[visible], counts[visible], num_close)
@@ -83,7 +83,7 @@ def scan_sweeps(
         columns = [points[:, :4], np.zeros((len(points), 1), np.float32)]
         if sensor.row_source == "laser":
             columns.append(sensor.num_rows - 1 - points[:, 4:])
-        pose = sensor_pose(world, mount, then_s)
+        pose = world.ego_pose(then_s) @ mount
         return Sweep(np.concatenate(columns, axis=1), pose, -age * round(SWEEP_S * 1e6))
 
     removed = "none" if reading.remove_close == "none" else "all"

@@ -61,11 +61,6 @@ def sample_mount(rng: Generator, sensor: Sensor, *, level: bool = False, streets
     return mount
 
 
-def sensor_pose(world: World, mount: np.ndarray, time_s: float) -> np.ndarray:
-    """Pose of the point frame in the street frame, f64[4, 4]; ``mount`` is from :func:`sample_mount`."""
-    return world.ego_pose(time_s) @ mount
-
-
 def scan(
     world: World,
     sensor: Sensor,
@@ -80,7 +75,7 @@ def scan(
     With ``rolling_shutter``, the ego vehicle and the objects move during the turn, and the points are compensated
     for the ego motion, as in nuScenes. Otherwise the turn takes no time.
     """
-    now = sensor_pose(world, mount, time_s)
+    now = world.ego_pose(time_s) @ mount
     begin = rng.uniform(-1, 1)
     rings = _sample_rings(world, sensor)
     edges = np.linspace(0, sensor.num_columns, (_SECTORS if rolling_shutter else 1) + 1).astype(int)
@@ -133,7 +128,7 @@ def _scan_sector(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points, mask of returns, and the number of rays towards each object and of rays that reach it."""
     streets = world.streets
-    pose = sensor_pose(world, mount, time_s)
+    pose = world.ego_pose(time_s) @ mount
     rotation, eye = pose[:3, :3], pose[:3, 3] + pose[:3, :3] @ np.array(sensor.origin_m)
     farthest = min(_FARTHEST_M, 2 * sensor.limit_xy_m)
     solids, hits = _first_hits(world, rings, fan, rotation, eye, farthest, time_s, rng)

@@ -34,7 +34,7 @@ def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callab
         return False
     with folder_lock(root / _WORK, "synthesizing"):
         if not finished:
-            atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
+            atomic_write(root / _ORDER, json.dumps(order, indent=1) + "\n")
             _write_scenes(spec, root, workers, report)
             _write_tables(spec, root)
         shutil.rmtree(root / _SHARDS, ignore_errors=True)

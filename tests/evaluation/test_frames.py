@@ -104,9 +104,10 @@ def test_truth_that_is_not_evaluated_is_reported():
 
 def test_invalid_metrics_are_rejected():
     for classes, ranges, message in (
-        ((), (), "classes: got .*expected at least one name"),
-        (("a", "b", "a"), (), "classes: got .*each once"),
-        (("a", "b"), (1.0,), "class_ranges_m: got .*expected 2 positive lengths"),
+        ((), (), "ranges_m: got .*expected a positive length for each of at least one class"),
+        (("a", "b"), (1.0, 0.0), "ranges_m: got .*expected a positive length"),
+        (("a", "b"), (1.0,), "shorter"),
+        (("a", "b", "a"), (), "classes: got .*expected different names"),
     ):
         with pytest.raises(ValueError, match=message):
             metric_of(classes, ranges)

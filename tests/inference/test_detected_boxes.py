@@ -63,6 +63,7 @@ def test_selection_by_score_and_class(made):
     assert [box.score for box in some] == [float(s) for s in made.scores[::2] if s >= 0.5]
     assert set(some.names) == {"car"}
     assert len(made.select(min_score=0.5, labels="car")) == len(some)
+    assert [(box.name, box.score) for box in made[3:5]] == [(made[i].name, made[i].score) for i in (3, 4)]
     with pytest.raises(ValueError, match="labels: got 'Car', expected car"):
         made.select(labels=["Car"])
     assert some.to_dict() == {
@@ -80,10 +81,6 @@ def test_boxes_draw_themselves_in_a_notebook(made):
     assert png == made.picture(min_score=0.3) != made.picture(min_score=0)
     assert made.picture() != made.picture(truth=(made.boxes, made.labels))
     assert Image.open(io.BytesIO(png)).width > 500
-
-
-def test_a_slice_holds_boxes(made):
-    assert [(box.name, box.score) for box in made[3:5]] == [(made[i].name, made[i].score) for i in (3, 4)]
 
 
 def test_a_detector_takes_files_arrays_of_jax_and_lists_and_prints_in_one_line(detector, tmp_path):

@@ -102,12 +102,12 @@ def test_a_file_of_an_older_version_is_read(home, tmp_path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda content: b"PK\x03\x04" + content, "found a file, expected a checkpoint folder or a file"),
-        (lambda content: content.replace(b"r 1", b"r 2", 1), "format: got '2', expected 1"),
+        (lambda content: b"PK" + content, "found a file with b'PKfcos-lidar-detector ', expected a check"),
+        (lambda content: content.replace(b"r 1", b"r 2", 1), "found a file with b'fcos-lidar-detector 2 '"),
         (lambda content: content.replace(b'"car"', b'"cat"', 1), ": damaged"),
         (lambda content: content[:-9] + bytes([content[-9] ^ 1]) + content[-8:], ": damaged"),
         (lambda content: content[:-100], ": damaged"),
-        (lambda content: b"", "found a file, expected a checkpoint folder or a file"),
+        (lambda content: b"", "found a file with b'', expected a checkpoint folder or a file"),
     ],
     ids=["foreign", "other format", "record", "program", "cut", "empty"],
 )

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 
 import jax
 import numpy as np
@@ -107,15 +106,6 @@ def test_the_graph_equals_the_network(name):
     for output, value in expected.items():
         assert found[output].shape == value.shape
         assert np.abs(found[output] - value).max() <= 1e-4 * np.abs(value).max(), output
-
-
-def test_the_graph_is_deterministic_and_describes_itself():
-    detector = made_detector(CONFIG, SENSOR)
-    content = network_graph(detector)
-    assert network_graph(made_detector(CONFIG, SENSOR)) == content
-    about = {entry.key: json.loads(entry.value) for entry in onnx.load_model_from_string(content).metadata_props}
-    assert about["classes"] == list(CONFIG.classes)
-    assert about["sensor"]["num_columns"] == SENSOR.num_columns
 
 
 def test_unknown_parameters_are_refused():

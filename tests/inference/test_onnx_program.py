@@ -1,6 +1,7 @@
 """The ONNX graph from points to boxes finds the same boxes as XLA."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 
 pytestmark = pytest.mark.slow
 
-pytest.importorskip("onnx", reason="onnx, of the extra onnx, is not installed")
+onnx = pytest.importorskip("onnx", reason="onnx, of the extra onnx, is not installed")
 onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime, of the extra onnx, is not installed")
 
 
@@ -48,10 +49,14 @@ def test_boxes_equal_xlas_except_for_rounding(name):
             assert np.abs(np.asarray(expected.boxes)[near] - box).max(axis=1).min() < 1e-3
 
 
-def test_unusable_rows_and_points_on_the_vehicle_are_dropped_and_the_file_is_deterministic():
+def test_the_file_is_deterministic_and_describes_itself_and_unusable_rows_are_dropped():
+    """Also points on the ego vehicle."""
     detector = tiny(CONFIG)
     content = program_graph(detector)
     assert program_graph(detector) == content
+    about = {entry.key: json.loads(entry.value) for entry in onnx.load_model_from_string(content).metadata_props}
+    assert about["classes"] == list(CONFIG.classes)
+    assert about["sensor"]["num_columns"] == SENSOR.num_columns
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     cloud = make_cloud(make_frame(0, SENSOR).points, CONFIG, sensor=SENSOR)
     points, rows = cloud.points.copy(), np.flatnonzero(~cloud.valid)[:4]

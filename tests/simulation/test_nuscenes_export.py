@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import contents, in_use
+from commands import assert_one_line_error, contents, in_use
 from kills import killed_twice
 from scipy.spatial.transform import Rotation
 
@@ -17,23 +17,6 @@ from fcos_lidar_jax.sensors import TINY, sensor_to_json
 
 VERSION = "v1.0-synthetic"
 ORDER = ["--scenes", "2", "--keyframes", "2", "--sensor", "tiny", "--seed", "4"]
-KEYS = {  # keys of the official tables
-    "attribute": "token name description",
-    "calibrated_sensor": "token sensor_token translation rotation camera_intrinsic",
-    "category": "token name description index",
-    "ego_pose": "token timestamp rotation translation",
-    "instance": "token category_token nbr_annotations first_annotation_token last_annotation_token",
-    "log": "token logfile vehicle date_captured location",
-    "map": "token log_tokens category filename",
-    "sample": "token timestamp prev next scene_token",
-    "sample_annotation": "token sample_token instance_token visibility_token attribute_tokens translation size "
-    "rotation prev next num_lidar_pts num_radar_pts",
-    "sample_data": "token sample_token ego_pose_token calibrated_sensor_token timestamp fileformat is_key_frame "
-    "height width filename prev next",
-    "scene": "token log_token nbr_samples first_sample_token last_sample_token name description",
-    "sensor": "token channel modality",
-    "visibility": "token level description",
-}
 
 
 def command(out: Path, *more: str) -> list[str]:
@@ -43,13 +26,6 @@ def command(out: Path, *more: str) -> list[str]:
 def synthesize(out: Path, *more: str) -> Path:
     assert cli.main(command(out, *more)) == 0
     return out
-
-
-def refusal(capsys, out: Path, *more: str) -> str:
-    """Run a command that must fail and return its single line of output."""
-    assert cli.main(command(out, *more)) == 1
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line
 
 
 def tables(root: Path) -> dict[str, list[dict]]:
@@ -63,12 +39,6 @@ def made(tmp_path_factory) -> Path:
 
 def test_the_layout_is_official(made):
     found = tables(made)
-    assert set(found) == {*KEYS, "splits"}
-    for name, keys in KEYS.items():
-        assert found[name], name
-        assert all(set(row) == set(keys.split()) for row in found[name]), name
-        tokens = [row["token"] for row in found[name]]
-        assert len(set(tokens)) == len(tokens)
     train, val = ["scene-0001"], ["scene-0002"]
     assert found["splits"] == {"train": train, "synthetic_train": train, "val": val, "synthetic_val": val}
     for row in found["sample_data"]:
@@ -85,6 +55,7 @@ def test_tokens_and_chains_refer_to_existing_rows(made):
     found = tables(made)
     by_token = {name: {row["token"]: row for row in rows} for name, rows in found.items() if name != "splits"}
     for name, rows in by_token.items():
+        assert len(rows) == len(found[name]) > 0, name
         for row in rows.values():
             for table in by_token:
                 if f"{table}_token" in row:
@@ -164,13 +135,13 @@ def test_folders_with_other_contents_are_refused(made, tmp_path, capsys):
     before = contents(made)
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
     for option, value in (("seed", 5), ("streets", "plain"), ("sensor", tmp_path / "near.json")):
-        line = refusal(capsys, made, f"--{option}", str(value))
-        assert f"{made}: found a data set begun with another {option}" in line
+        line = command(made, f"--{option}", str(value))
+        assert_one_line_error(capsys, line, f"{made}: found a data set begun with another {option}")
     own = tmp_path / "own"
     with in_use(own / ".synthesize"):
-        assert " is at work, expected no other process" in refusal(capsys, own)
+        assert_one_line_error(capsys, command(own), " is at work, expected no other process")
     (own / "thesis.txt").write_text("mine")
-    assert "found other files, expected an empty folder" in refusal(capsys, own)
+    assert_one_line_error(capsys, command(own), "found other files, expected an empty folder")
     assert (own / "thesis.txt").read_text() == "mine"
     moved = {"forward_rad": 0.0, "origin_m": [1, 0, 2], "limit_z_m": [-3, 5]}  # the layout's own are written
     (tmp_path / "moved.json").write_text(json.dumps({**sensor_to_json(TINY), **moved}))

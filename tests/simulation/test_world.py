@@ -15,7 +15,7 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.sensors import TINY, Sensor, even_inclinations, sector
 from fcos_lidar_jax.simulation.frames import scan_sweeps
 from fcos_lidar_jax.simulation.ground import Ground
-from fcos_lidar_jax.simulation.lidar import SWEEP_S, Scan, sample_mount, scan, sensor_pose
+from fcos_lidar_jax.simulation.lidar import SWEEP_S, Scan, sample_mount, scan
 from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, travelled, velocity_at
 from fcos_lidar_jax.simulation.nuscenes_tables import attribute_of, visibility_of
 from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_size
@@ -215,7 +215,7 @@ def test_fused_sweeps_align_static_objects_and_trail_behind_moving_objects():
     np.testing.assert_array_equal(points[np.r_[True, np.diff(points[:, 4]) != 0], 4], lags)
     current = scan_fine(world, 1.0, 7)
     np.testing.assert_array_equal(points[points[:, 4] == 0, :4], current.points[current.returned, :4])
-    now = sensor_pose(world, LEVEL, 1.0)
+    now = world.ego_pose(1.0) @ LEVEL
     off = []
     for age, lag in enumerate(lags):
         there = points[points[:, 4] == lag, :3].astype(float) @ now[:3, :3].T + now[:3, 3]
@@ -223,7 +223,7 @@ def test_fused_sweeps_align_static_objects_and_trail_behind_moving_objects():
         x = there[(there[:, 2] > 0.5) & (there[:, 1] < 14) & (there[:, 1] > 10), 0]
         # The tolerance covers ray spacing and noise.
         assert (x.min() + x.max()) / 2 == pytest.approx(8 + 8 * (1 - lag), abs=0.12)
-        then = sensor_pose(world, LEVEL, 1.0 - age * SWEEP_S)
+        then = world.ego_pose(1.0 - age * SWEEP_S) @ LEVEL
         own = (there - then[:3, 3]) @ then[:3, :3]
         unmoved = own @ now[:3, :3].T + now[:3, 3]  # result of a fusion without poses
         off.append(np.median(np.abs(unmoved[there[:, 1] > 28] - there[there[:, 1] > 28]).max(axis=1)))
@@ -235,7 +235,7 @@ def test_fused_sweeps_align_static_objects_and_trail_behind_moving_objects():
 def test_a_rolling_shutter_shifts_only_moving_objects(speed):
     starts = (-12, 0, 12)
     world = made_by_hand(make_motion(speed=speed), [(x, -9.0, 12.0, (4, 2, 3)) for x in starts], WALL)
-    found, pose = [], sensor_pose(world, LEVEL, 1.0)
+    found, pose = [], world.ego_pose(1.0) @ LEVEL
     for rolling in (False, True):
         sweep = scan_fine(world, 1.0, 5, rolling_shutter=rolling)
         points = sweep.points[sweep.returned, :3].astype(float) @ pose[:3, :3].T + pose[:3, 3]
@@ -254,7 +254,7 @@ def test_the_seen_share_is_the_share_of_unblocked_rays():
     objects = [(20, 0, 0, (0.2, 8, 3)), (10, 1, 0, (0.2, 2, 3)), (-15, 0, 0, (2, 2, 2))]
     world = made_by_hand(make_motion(), objects)
     share = scan_fine(world).seen_share
-    eye = sensor_pose(world, LEVEL, 0.0)[:3, 3]
+    eye = (world.ego_pose(0.0) @ LEVEL)[:3, 3]
     wide, hidden = 2 * np.arctan2(4, 19.9 - eye[0]), np.arctan2(2, 9.9 - eye[0])
     # The near object blocks all rays to the far object within its own azimuth span.
     assert share[0] == pytest.approx(1 - hidden / wide, abs=0.04)

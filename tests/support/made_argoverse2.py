@@ -12,7 +12,7 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
 from fcos_lidar_jax.simulation.frames import boxes_in_sensor_frame
-from fcos_lidar_jax.simulation.lidar import sample_mount, scan, sensor_pose
+from fcos_lidar_jax.simulation.lidar import sample_mount, scan
 from fcos_lidar_jax.simulation.world import sample_world
 
 START_NS, STEP_NS = 315_966_265_259_836_000, 100_200_000
@@ -80,7 +80,7 @@ def make_log(log: Path, seed: int, *, sweeps: int = 4, sensor: Sensor = ARGOVERS
         points = scanned.points[scanned.returned]
         points[:, 4] = sensor.num_rows - 1 - points[:, 4]
         write_sweep(log, time_ns, points)
-        boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, i * seconds), i * seconds)
+        boxes = boxes_in_sensor_frame(world, world.ego_pose(i * seconds) @ mount, i * seconds)
         counts = count_inside(points, boxes)
         rows += [
             {"time_ns": time_ns, "track": k, "category": CATEGORIES[label], "box": box[:7], "count": count}
@@ -88,7 +88,7 @@ def make_log(log: Path, seed: int, *, sweeps: int = 4, sensor: Sensor = ARGOVERS
             if count > 0
         ]
     halves = np.arange(2 * sweeps)
-    poses = np.array([city @ sensor_pose(world, mount, i * seconds / 2) for i in halves])
+    poses = np.array([city @ (world.ego_pose(i * seconds / 2) @ mount) for i in halves])
     write_poses(log, START_NS + STEP_NS // 2 * halves, poses)
     write_boxes(log, rows)
     return log
