@@ -19,15 +19,13 @@ from fcos_lidar_jax.data.cloud_policy import truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.progress import tell
-from fcos_lidar_jax.sensors import KITTI_HDL64E
 
-_LISTED = Excludes(("files", "full_turn"), "the list names the files, which keep all points")
+_LISTED = Excludes(("files",), "the list names the files")
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
 
@@ -118,11 +116,6 @@ def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
         distinct = dict[str, Path]()
         for file in find_clouds(args.files):
             distinct.setdefault(os.path.abspath(file), file)
-        files = tuple(distinct.values())
-        if args.full_turn and not any(usual_sensor(file) == KITTI_HDL64E for file in files):
-            raise ValueError(f"--full-turn: expected none for {files[0]}: only files of KITTI are cropped")
-        return files, []
-    if args.sweeps.suffix != ".json":
-        raise ValueError(f"--sweeps: {args.sweeps}: expected a file that ends in .json")
+        return tuple(distinct.values()), []
     folder, sweeps = args.sweeps.parent, read_list(args.sweeps)
     return (args.sweeps,), [msgspec.structs.replace(each, file=str(folder / each.file)) for each in sweeps]

@@ -11,17 +11,15 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
-from fcos_lidar_jax.data.folder import belongs_to_own_data
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import SampleAnnotation, Scene, read_table
 from fcos_lidar_jax.fields import Count
-from fcos_lidar_jax.files import folder_lock, refusing
+from fcos_lidar_jax.files import check_writable, folder_lock, refusing
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import NUSCENES
@@ -56,9 +54,7 @@ def run(args: Prepare) -> None:
     folder = args.data.index or data.index
     more = "; name one by --index, here and for train"
     with refusing("--index", PermissionError, kind=PermissionError, more=more):
-        check_out_folder(folder, "--index")
-    if belongs_to_own_data(folder / "objects"):
-        raise ValueError(f"--index: {folder}: a folder of own data, expected another one")
+        check_writable(folder / ".lock")
     jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
     split = _training_split(args, data)
     tell(f"writing to {folder}" + ("" if args.data.index else "; --index names another folder"))

@@ -8,15 +8,10 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
-from fcos_lidar_jax.files import atomic_path, import_extra
+from fcos_lidar_jax.files import atomic_path
 from fcos_lidar_jax.visualization.figure import class_color
 
 _HIGH_M = 4.0  # height above ground at the end of the colour scale
-
-
-def check_rerun() -> None:
-    """Refuse a recording if rerun is not installed."""
-    import_extra("rerun", "viz", "--rrd: ")
 
 
 @contextlib.contextmanager

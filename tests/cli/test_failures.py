@@ -38,14 +38,9 @@ def fail_with(error):
         (RecursionError("maximum recursion depth"), "nested too deeply: expected a file or an option with fewer"),
         (MemoryError(), "out of memory: for training, --optimizer.accumulate"),
         (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: for training, --optimizer.accumulate"),
-        (RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"), "another process ended, see its output: UNK"),
         (
-            RuntimeError("Gloo context initialization failed: Read error"),
-            "the connection between the processes failed: G",
-        ),
-        (
-            RuntimeError("Gloo AllGather failed: Timed out"),
-            "the connection between the processes failed: Gloo AllGather",
+            RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
+            "another process ended, see its output, or the",
         ),
         (ValueError("x" * 120_000), "x" * 900),
     ],
@@ -88,12 +83,6 @@ PLATFORM = "expected a platform of this machine, or, for NVIDIA GPUs, pip instal
             *("JAX_PLATFORM_NAME", "gpu", RuntimeError("Unknown backend: 'gpu' requested")),
             f"JAX_PLATFORM_NAME: got 'gpu', {PLATFORM}",
         ),
-        (
-            *("JAX_TRANSFER_GUARD", "disallow", RuntimeError("Disallowed host-to-device transfer")),
-            "the environment has JAX_TRANSFER_GUARD=disallow, which makes JAX refuse more than usual: Disallowed",
-        ),
-        ("JAX_DEBUG_NANS", "1", FloatingPointError("nan in jit"), "the environment has JAX_DEBUG_NANS=1, which"),
-        ("JAX_DEBUG_NANS", "1", ValueError("a.npy: no such file"), "a.npy: no such file"),
     ],
 )
 def test_what_the_environment_of_jax_breaks_is_no_bug(capsys, monkeypatch, name, value, error, message):

@@ -192,7 +192,7 @@ def test_all_outputs_have_the_sweeps_before_an_invalid_cloud(home, tmp_path, cap
         recorded.append(record.call_count)
 
     monkeypatch.setattr("fcos_lidar_jax.cli.sinks.rerun_recording", recording)
-    monkeypatch.setattr("fcos_lidar_jax.cli.checks.check_rerun", Mock())
+    monkeypatch.setattr("fcos_lidar_jax.cli.checks.import_extra", Mock())
     out, page = tmp_path / "boxes.jsonl", tmp_path / "page.html"
     views = ["--page", str(page), "--rrd", str(tmp_path / "a.rrd")]
     args = ["stream", str(tmp_path), "--checkpoint", str(home / "checkpoint"), *views, "--out", str(out)]

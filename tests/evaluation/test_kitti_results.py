@@ -215,7 +215,7 @@ def test_damaged_files_are_named_before_anything_is_detected(root, tmp_path, mon
         ("--split some", "found: sample 000001: missing; .*: expected the 2 samples of split 'some'$"),
         (
             "--results found/9.txt",
-            "--results: found/9.txt: found no folder, expected the folder of KITTI's result",
+            "--results: found/9.txt: expected --checkpoint too, .*, or a folder of KITTI's",
         ),
     ],
 )
