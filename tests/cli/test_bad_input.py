@@ -10,9 +10,8 @@ import pytest
 from commands import assert_one_line_error, command, contents, in_use, mistakes
 from made_kitti import calibration_text
 from made_nuscenes import VERSION, make_tables, write
-from tiny_run import TINY_CONFIG, untrained
+from tiny_run import TINY_CONFIG, save_untrained
 
-from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -21,8 +20,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 def home(tmp_path_factory):
     """Clouds, poses, a checkpoint, its export and a data set in the nuScenes layout."""
     folder = tmp_path_factory.mktemp("home")
-    checkpoint = Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 7)
-    save_checkpoint(folder / "checkpoint", checkpoint)
+    save_untrained(folder / "checkpoint")
     command("export --checkpoint", folder / "checkpoint", "--out", folder / "detector.fcos")
     points = make_frame(0, TINY).points
     drive = folder / "training" / "velodyne"
@@ -55,6 +53,7 @@ detect HOME/good.npy HOME/none.npy => none.npy: no such file
 detect HOME/away.npy HOME/no_rows.npy => away.npy: none of its .* points is usable
 detect HOME/training => training: no point file in it, expected [^;]*$
 detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
+detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, 
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
 detect HOME/good.npy --min-score 50 => --min-score: got 50.0, expected within \[0, 1\]$
 detect HOME/good.npy --labels submarine => --labels: got 'submarine', expected some of
@@ -100,6 +99,7 @@ project HOME/away.npy => away.npy: none of its
 project HOME/good.npy --png HOME/good.npy => --png: .*the same file as
 synthesize --scenes 1 --sensor argoverse2 => --sensor: got argoverse2, whose rows come from laser numbers
 export --checkpoint HOME/checkpoint --out HOME => found a folder
+export --checkpoint HOME/detector.fcos => found a file, expected a checkpoint folder
 export --checkpoint HOME/checkpoint --network-only => --network-only: got True, expected only with --format onnx$
 benchmark --checkpoint HOME/checkpoint --batch 0 => --batch: got \(0,\), expected at least 1
 benchmark --checkpoint HOME/detector.fcos --batch 2 => batch size: got 2
@@ -148,7 +148,7 @@ def test_recordings_need_rerun(home, tmp_path, capsys, monkeypatch, line):
 
 def test_other_classes_are_not_of_nuscenes(home, tmp_path, capsys):
     other = dataclasses.replace(TINY_CONFIG, classes=("hovercraft", *TINY_CONFIG.classes[1:]))
-    save_checkpoint(tmp_path / "other", Checkpoint(other, TINY, untrained(other, TINY), 7))
+    save_untrained(tmp_path / "other", other)
     words = ["detect", "--sweeps", str(home / "poses.json"), "--output-format", "nuscenes", "--checkpoint"]
     words += [str(tmp_path / "other"), "--out", str(tmp_path / "out")]
     assert_one_line_error(capsys, words, "nuscenes: got the classes hovercraft, expected only")

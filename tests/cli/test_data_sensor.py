@@ -13,11 +13,11 @@ from commands import command, page_content
 from made_argoverse2 import make_log
 from made_folder import make_folder
 from made_kitti import make_kitti, write_raw_drive
-from tiny_run import CONFIG, NETWORK_OPTIONS, untrained
+from tiny_run import CONFIG, NETWORK_OPTIONS, save_untrained
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax import cli, progress
-from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
@@ -34,7 +34,7 @@ def _small(tmp_path_factory):
     sensor = dataclasses.replace(NUSCENES_HDL32E, num_columns=128)
     inference = InferenceConfig(min_probability=0.5, max_detections=300, candidates_per_level=100)
     config = dataclasses.replace(CONFIG, max_points=20_000, inference=inference)
-    save_checkpoint(folder / "small", Checkpoint(config, sensor, untrained(config, sensor), 1))
+    save_untrained(folder / "small", config, sensor)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         yield

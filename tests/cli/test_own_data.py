@@ -80,18 +80,6 @@ def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_p
     assert not (tmp_path / "out").exists()
 
 
-def test_objects_of_changed_frames_without_splits_are_refused(tmp_path, capsys):
-    data = make_folder(tmp_path / "data", train=1, val=0)
-    (data / "splits.json").unlink()
-    command("prepare --data-root", data)
-    np.save(data / "clouds" / "000.npy", np.load(data / "clouds" / "000.npy")[1:])
-    train = (
-        f"train quickstart --data-root {data} --out {tmp_path}/out --copy-paste.targets 2 2 2 --steps 1 --classes"
-    )
-    message = "all_frames: cut from other frames than all frames, or with other options, .* or --full-turn"
-    assert_one_line_error(capsys, [*train.split(), *CLASSES], message)
-
-
 def test_classes_that_the_data_do_not_have_are_named_in_a_warning(tmp_path, capsys):
     data = make_folder(tmp_path / "data", train=1, val=0)
     for name, warned in (("vehicel", True), ("vehicle", False)):

@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import command, free_port, in_use
+from commands import command, free_port
 from forked import Forked, signal_at
 from linear_network import linear_network, use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained
@@ -179,16 +179,6 @@ def test_processes_with_different_detectors_are_refused(root, tmp_path):
     line = "process 1: detector, frames or batch size: different from process 0, expected the same"
     for code, _, errors in ended(start_two("coordinator", *both, before=(use, use))):
         assert (code, error_lines(errors)) == (1, [f"fcos-lidar: error: {line}"])
-
-
-def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
-    out, line = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see its output"
-    both = [evaluate(root, out, *linear(root))] * 2
-    with in_use(out):
-        first, second = ended(start_two("coordinator", *both, before=(use, use)))
-    assert (first[0], second[0]) == (1, 1)
-    assert "in use: process" in error_lines(first[2])[0]
-    assert error_lines(second[2]) == [line]
 
 
 def start_one(args: list[str], before: Callable[[], object]) -> list[Forked]:
