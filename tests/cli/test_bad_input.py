@@ -93,7 +93,6 @@ evaluate DATA --distributed --checkpoint quickstart --backend openvino => --back
 train quickstart --data-root gs://b/run => gs://b/run: got a URL, expected a path: copy
 train quickstart --format simulated => all 100000 frames .* --no-class-balanced --no-copy-paste, or at most
 train quickstart DATA --train-split all --val-split none => made: no index here, .* run fcos-lidar prepare$
-prepare DATA --train-split other --index OUT => split 'other': not found
 prepare --format simulated --index OUT => simulated frames need no preparation
 project HOME/away.npy => away.npy: none of its
 project HOME/good.npy --png HOME/good.npy => --png: .*the same file as

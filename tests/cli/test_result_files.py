@@ -230,15 +230,12 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monk
 
 def test_files_of_own_data_are_not_overwritten(home, tmp_path, capsys):
     call = ["detect", str(home / "training" / "velodyne"), "--checkpoint", str(home / "checkpoint"), "--out"]
-    (tmp_path / "clouds").mkdir()
-    places = ["boxes/000.json", "sweeps/000.json", "splits.json"]
-    for out in map(tmp_path.joinpath, places):
-        assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
-        assert not out.exists()
-    out = tmp_path / "clouds" / "a.npy"
-    command(*call, out)  # not own data yet: any folder may be called clouds
-    (tmp_path / "boxes").mkdir()
-    assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
+    for folder in ("clouds", "boxes"):
+        (tmp_path / folder).mkdir()
+    for out in ("boxes/000.json", "sweeps/000.json", "splits.json", "clouds/a.npy"):
+        message = "the place of a file of own data, expected another one"
+        assert_one_line_error(capsys, [*call, str(tmp_path / out)], message)
+        assert not (tmp_path / out).exists()
 
 
 def test_detect_and_evaluate_write_recordings(home, tmp_path):
