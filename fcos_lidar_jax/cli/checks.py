@@ -70,10 +70,9 @@ def check_options(command: Any) -> None:
     options = dict(_options(command))
     for name, option in options.items():
         _check_rules(name, options)
-        if isinstance(option.value, str):
-            local_path(option.value)
-        for path in option.paths():
-            local_path(path)
+        for value in (option.value, *option.paths()):
+            if isinstance(value, str | Path):
+                local_path(value)
     if "rrd" in options and options["rrd"].is_given:
         import_extra("rerun", "viz", "--rrd: ")
     _check_outputs(options)

@@ -26,17 +26,12 @@ class ProcessOptions:
     process_index: Annotated[int | None, Needs("coordinator"), option("I")] = None
     """Index of this process, from 0."""
 
-    @property
-    def several(self) -> bool:
-        """Whether there may be other processes."""
-        return self.distributed or self.coordinator is not None
-
 
 def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.environ) -> None:
     """Connect to the other processes, if any. Call this before JAX lists its devices."""
-    if not options.several:
-        return
     by_hand = options.coordinator
+    if by_hand is None and not options.distributed:
+        return
     is_address = by_hand is None or bool(re.fullmatch(r".+:\d{1,5}", by_hand))
     check(is_address, "--coordinator", by_hand, "HOST:PORT")
     cluster = by_hand or "--distributed"

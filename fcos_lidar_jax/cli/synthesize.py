@@ -42,6 +42,9 @@ class Synthesize:
 
 def run(args: Synthesize) -> None:
     """Write the data set, and print a record of it."""
+    is_name = Path(args.version).name == args.version and not args.version.startswith(".")
+    if not is_name or args.version in ("", "samples", "sweeps", "maps"):
+        raise ValueError(f"--version: got {args.version!r}, expected a name for the folder of the tables")
     sensor = in_frame_of(load_sensor(args.sensor), NUSCENES_HDL32E)  # as all readers of this layout expect
     if sensor.row_source == "laser":
         raise ValueError(

@@ -1,6 +1,8 @@
 """Recording of a drive for the rerun viewer (extra ``viz``)."""
 
 import contextlib
+import functools
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,10 +30,8 @@ def rerun_recording(
     with atomic_path(path) as temporary:
         recording = rr.RecordingStream("fcos_lidar_jax")
         recording.save(temporary)
-        number = iter(range(2**63))
         with recording:
-            fixed = recording, number, classes, min_score
-            yield lambda *given, **named: _record(*fixed, *given, **named)
+            yield functools.partial(_record, recording, itertools.count(), classes, min_score)
         recording.disconnect()
 
 

@@ -70,27 +70,20 @@ PLATFORM = "expected a platform of this machine, or, for NVIDIA GPUs, pip instal
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "error", "message"),
+    ("name", "value", "error"),
     [
-        ("JAX_PLATFORMS", "cuda", AssertionError(), f"JAX_PLATFORMS: got 'cuda', {PLATFORM}"),
-        (
-            "JAX_PLATFORMS",
-            "x",
-            RuntimeError("Unable to initialize backend 'x'"),
-            f"JAX_PLATFORMS: got 'x', {PLATFORM}",
-        ),
-        (
-            *("JAX_PLATFORM_NAME", "gpu", RuntimeError("Unknown backend: 'gpu' requested")),
-            f"JAX_PLATFORM_NAME: got 'gpu', {PLATFORM}",
-        ),
+        ("JAX_PLATFORMS", "cuda", AssertionError()),
+        ("JAX_PLATFORMS", "x", RuntimeError("Unable to initialize backend 'x'")),
+        ("JAX_PLATFORM_NAME", "gpu", RuntimeError("Unknown backend: 'gpu' requested")),
     ],
 )
-def test_what_the_environment_of_jax_breaks_is_no_bug(capsys, monkeypatch, name, value, error, message):
+def test_a_platform_that_jax_lacks_is_no_bug(capsys, monkeypatch, name, value, error):
+    for each in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(name, value)
-    monkeypatch.delenv("JAX_PLATFORMS" if name != "JAX_PLATFORMS" else "JAX_PLATFORM_NAME", raising=False)
     monkeypatch.setattr("jax.devices", fail_with(AssertionError()))
     assert exit_code("program", fail_with(error)) == 1
-    assert capsys.readouterr().err.startswith(f"program: error: {message}")
+    assert capsys.readouterr().err.startswith(f"program: error: {name}: got {value!r}, {PLATFORM}")
 
 
 @pytest.mark.slow

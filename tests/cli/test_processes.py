@@ -181,12 +181,6 @@ def test_processes_with_different_detectors_are_refused(root, tmp_path):
         assert (code, error_lines(errors)) == (1, [f"fcos-lidar: error: {line}"])
 
 
-def start_one(args: list[str], before: Callable[[], object]) -> list[Forked]:
-    """Start a cluster of one process."""
-    place = ["--coordinator", f"localhost:{free_port()}", "--num-processes=1", "--process-index=0"]
-    return [Forked([*args, *place], before)]
-
-
 def use_and_signal_at(*where: object) -> None:
     use()
     signal_at(*where)
@@ -207,7 +201,8 @@ def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path):
 def test_sigterm_ends_the_scoring_too(root, tmp_path):
     stop = functools.partial(use_and_signal_at, "fcos_lidar_jax.evaluation.summary.bootstrap", signal.SIGTERM)
     args = evaluate(root, tmp_path / "alone", *linear(root), "--bootstrap", "9")
-    ((code, _, errors),) = ended(start_one(args, stop))
+    place = ["--coordinator", f"localhost:{free_port()}", "--num-processes=1", "--process-index=0"]
+    code, _, errors = Forked([*args, *place], stop).end()
     assert (code, error_lines(errors)) == (143, []), errors
     assert (tmp_path / "alone" / "results_nusc.json").exists()
     assert not (tmp_path / "alone" / "bootstrap.json").exists()
