@@ -68,7 +68,7 @@ class Detect:
 
 def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
-    files, sweeps = _inputs(args)
+    files, sweeps = _inputs(args.files, args.sweeps)
     parts = [Path(sweep.file) for sweep in sweeps]
     detector = load_detector(args.checkpoint, backend=args.backend)
     classes, config = detector.classes, detector.config
@@ -107,15 +107,15 @@ def run(args: Detect) -> None:
         tell(line)
 
 
-def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
+def _inputs(inputs: tuple[Path, ...], listed: Path | None) -> tuple[tuple[Path, ...], list[ListedSweep]]:
     """The files, each once; or the list of sweeps, and its entries with the paths of their files."""
-    for file in args.files:
+    for file in inputs:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
-    if args.sweeps is None:
+    if listed is None:
         distinct = dict[str, Path]()
-        for file in find_clouds(args.files):
+        for file in find_clouds(inputs):
             distinct.setdefault(os.path.abspath(file), file)
         return tuple(distinct.values()), []
-    folder, sweeps = args.sweeps.parent, read_list(args.sweeps)
-    return (args.sweeps,), [msgspec.structs.replace(each, file=str(folder / each.file)) for each in sweeps]
+    sweeps = read_list(listed)
+    return (listed,), [msgspec.structs.replace(each, file=str(listed.parent / each.file)) for each in sweeps]

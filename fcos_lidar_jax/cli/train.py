@@ -150,7 +150,7 @@ def _open(args: Train) -> _Task:
         args.config,
         augment=None if args.no_augment else args.config.augment,
         copy_paste=None if args.no_copy_paste else args.config.copy_paste,
-        refinement=_refinement(args),
+        refinement=_refinement(args.config.refinement, args.second_look),
     )
     options = {"threads": args.threads, "workers": args.workers, "num_processes": jax.process_count()}
     check_loader_options(config, **options)  # before objects are cut
@@ -181,10 +181,10 @@ def _open(args: Train) -> _Task:
     return _Task(config, split, frames, tests, steps, objects, cuts_objects)
 
 
-def _refinement(args: Train) -> RefinementConfig | None:
-    if args.second_look is None:
-        return args.config.refinement
-    return None if args.second_look == "off" else args.config.refinement or RefinementConfig()
+def _refinement(of_preset: RefinementConfig | None, second_look: str | None) -> RefinementConfig | None:
+    if second_look is None:
+        return of_preset
+    return None if second_look == "off" else of_preset or RefinementConfig()
 
 
 def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
