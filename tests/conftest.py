@@ -103,3 +103,12 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from two_scenes import make_two_scenes  # imports the package, whose signatures are checked from here on
 
     return make_two_scenes(tmp_path_factory.mktemp("home"))
+
+
+@pytest.fixture
+def linear() -> Iterator[None]:
+    """Detectors that are built have a network of one layer."""
+    from linear_network import linear_network
+
+    with linear_network():
+        yield

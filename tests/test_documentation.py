@@ -1,6 +1,5 @@
 """The documents do what they say: code runs, commands exist."""
 
-import ast
 import builtins
 import dataclasses
 import doctest
@@ -11,6 +10,7 @@ import json
 import pkgutil
 import re
 import shlex
+import symtable
 import sys
 from pathlib import Path
 
@@ -112,13 +112,12 @@ def test_examples_use_the_imports_of_the_reference():
         own = {other.rpartition(".")[2] for other in referred() if other.startswith(f"{name.rpartition('.')[0]}.")}
         own |= {n for n, v in vars(module).items() if belongs_to(module, v)}
         for example in doctest.DocTestFinder(recurse=False).find(value, name, module=module):
-            tree = ast.parse("".join(step.source for step in example.examples))
-            named = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
-            made = {node.id for node in named if isinstance(node.ctx, ast.Store)}
-            made |= {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
-            made |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
-            made |= {(a.asname or a.name) for n in ast.walk(tree) for a in getattr(n, "names", [])}
-            used = {node.id for node in named if isinstance(node.ctx, ast.Load)}
+            scopes = [symtable.symtable("".join(step.source for step in example.examples), name, "exec")]
+            for scope in scopes:
+                scopes += scope.get_children()
+            symbols = [symbol for scope in scopes for symbol in scope.get_symbols()]
+            made = {s.get_name() for s in symbols if s.is_assigned() or s.is_imported() or s.is_parameter()}
+            used = {s.get_name() for s in symbols if s.is_referenced()}
             if rest := used - made - own - given.keys() - set(dir(builtins)):
                 missing[name] = rest
     assert missing == {}

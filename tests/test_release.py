@@ -37,25 +37,20 @@ def test_workflows_only_call_the_scripts_and_all_of_them():
     assert all((SCRIPTS / name).is_file() for name in called)
 
 
-def real_data_of(repository: Path) -> str:
-    """What the search for real data prints in a repository."""
-    (repository / ".ci").mkdir(parents=True)
-    shutil.copy(SCRIPTS / "real_data", repository / ".ci")
-    command = ["bash", repository / ".ci" / "real_data"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-
-@pytest.mark.parametrize("place", ["data", "shared/data"])
-def test_real_data_are_found_beside_the_repository(place, tmp_path):
-    data = tmp_path / "work" / place
+@pytest.mark.parametrize(
+    ("place", "found"),
+    [
+        *(("data", True), ("shared/data", True)),
+        *(("holdout", False), ("shared/holdout", False), ("far/shared/data", False)),
+    ],
+)
+def test_real_data_are_found_beside_the_repository_but_not_held_out_or_far_away(place, found, tmp_path):
+    data, scripts = tmp_path / "work" / place, tmp_path / "work" / "main" / ".ci"
     (data / "nuscenes_scene0523").mkdir(parents=True)
-    assert real_data_of(tmp_path / "work" / "main") == str(data)
-
-
-@pytest.mark.parametrize("place", ["holdout", "shared/holdout", "far/shared/data"])
-def test_held_out_and_far_folders_are_no_real_data(place, tmp_path):
-    (tmp_path / "work" / place / "nuscenes_scene0523").mkdir(parents=True)
-    assert real_data_of(tmp_path / "work" / "main") == ""
+    scripts.mkdir(parents=True)
+    script = shutil.copy(SCRIPTS / "real_data", scripts)
+    printed = subprocess.run(["bash", script], capture_output=True, text=True, check=True).stdout
+    assert printed.strip() == (str(data) if found else "")
 
 
 def followed(site: Path) -> subprocess.CompletedProcess:

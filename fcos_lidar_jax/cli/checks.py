@@ -11,8 +11,7 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.folder import belongs_to_own_data
 from fcos_lidar_jax.data.point_files import ENDINGS
 from fcos_lidar_jax.fields import Bounds
-from fcos_lidar_jax.files import check_writable, local_path
-from fcos_lidar_jax.visualization.rerun_recording import check_rerun
+from fcos_lidar_jax.files import check_writable, import_extra, local_path
 
 _POSITIONAL = {"files": "INPUT", "source": "SOURCE"}
 
@@ -71,12 +70,11 @@ def check_options(command: Any) -> None:
     options = dict(_options(command))
     for name, option in options.items():
         _check_rules(name, options)
-        if isinstance(option.value, str):
-            local_path(option.value)
-        for path in option.paths():
-            local_path(path)
+        for value in (option.value, *option.paths()):
+            if isinstance(value, str | Path):
+                local_path(value)
     if "rrd" in options and options["rrd"].is_given:
-        check_rerun()
+        import_extra("rerun", "viz", "--rrd: ")
     _check_outputs(options)
 
 
@@ -130,19 +128,12 @@ def _check_outputs(options: dict[str, _Option]) -> None:
                 _check_outside(option_name(name), out, checkpoint)
             is_result = option.output is Output.RESULT
             if option.output is Output.FOLDER or (is_result and options["output_format"].value == "kitti"):
-                check_out_folder(out, option_name(name))
+                check_writable(out / ".lock")
             else:
                 check_out_file(option_name(name), out, keep)
                 if is_result and out.is_file() and out.name.lower().endswith(ENDINGS):
                     raise ValueError(f"{option_name(name)}: {out}: found a point file, expected another one")
             keep.append(out)
-
-
-def check_out_folder(out: Path, option: str = "--out") -> None:
-    """Reject a file, and a folder that cannot be written to."""
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{option}: {out}: found a file, expected a folder")
-    check_writable(out / ".lock")
 
 
 def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:

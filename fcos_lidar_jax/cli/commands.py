@@ -41,15 +41,13 @@ def parse(argv: Sequence[str]) -> Callable[[], object]:
     """Parse the arguments; returns the command, ready to run. Usage errors exit with 2; bad values raise
     ValueError.
     """
-    output, rejection, command = io.StringIO(), None, None
+    output = io.StringIO()
     try:
         with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             command = _parse(argv)
     except SystemExit as leaving:
-        rejection = _rejection(leaving)
-    if rejection is not None:
-        raise ValueError(rejection)
-    if command is None:
+        if (rejection := _rejection(leaving)) is not None:
+            raise ValueError(rejection) from None
         command = _parse(argv)  # again, to print the help or the usage error
     run = next(run for kind, run, _ in _COMMANDS.values() if isinstance(command, kind))
 

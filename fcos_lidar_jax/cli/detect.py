@@ -19,15 +19,13 @@ from fcos_lidar_jax.data.cloud_policy import truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.progress import tell
-from fcos_lidar_jax.sensors import KITTI_HDL64E
 
-_LISTED = Excludes(("files", "full_turn"), "the list names the files, which keep all points")
+_LISTED = Excludes(("files",), "the list names the files")
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
 
@@ -70,7 +68,7 @@ class Detect:
 
 def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
-    files, sweeps = _inputs(args)
+    files, sweeps = _inputs(args.files, args.sweeps)
     parts = [Path(sweep.file) for sweep in sweeps]
     detector = load_detector(args.checkpoint, backend=args.backend)
     classes, config = detector.classes, detector.config
@@ -109,20 +107,15 @@ def run(args: Detect) -> None:
         tell(line)
 
 
-def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
+def _inputs(inputs: tuple[Path, ...], listed: Path | None) -> tuple[tuple[Path, ...], list[ListedSweep]]:
     """The files, each once; or the list of sweeps, and its entries with the paths of their files."""
-    for file in args.files:
+    for file in inputs:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
-    if args.sweeps is None:
+    if listed is None:
         distinct = dict[str, Path]()
-        for file in find_clouds(args.files):
+        for file in find_clouds(inputs):
             distinct.setdefault(os.path.abspath(file), file)
-        files = tuple(distinct.values())
-        if args.full_turn and not any(usual_sensor(file) == KITTI_HDL64E for file in files):
-            raise ValueError(f"--full-turn: expected none for {files[0]}: only files of KITTI are cropped")
-        return files, []
-    if args.sweeps.suffix != ".json":
-        raise ValueError(f"--sweeps: {args.sweeps}: expected a file that ends in .json")
-    folder, sweeps = args.sweeps.parent, read_list(args.sweeps)
-    return (args.sweeps,), [msgspec.structs.replace(each, file=str(folder / each.file)) for each in sweeps]
+        return tuple(distinct.values()), []
+    sweeps = read_list(listed)
+    return (listed,), [msgspec.structs.replace(each, file=str(listed.parent / each.file)) for each in sweeps]

@@ -16,13 +16,14 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import Excludes, Or, Output, check_out_file, option_name
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
-from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
+from fcos_lidar_jax.cli.processes import ProcessOptions, join_processes
 from fcos_lidar_jax.cli.scoring import Task, run_detector, write_recording, write_reports, write_scores
 from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.kitti import KittiFrames, cropped
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
-from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
+from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark, compare_by_distance
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, score_kitti
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
@@ -33,7 +34,6 @@ from fcos_lidar_jax.inference.alignment import heading, other_rows
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
-from fcos_lidar_jax.visualization.evaluation_report import PAGE
 
 _TOO_HIGH = "scores on training frames are too high"
 _NO_DETECTION = Excludes(("backend", "batch_size", "yaw_deg", "distributed", "coordinator"), "nothing is detected")
@@ -41,7 +41,6 @@ _NO_DATA = Excludes(
     ("checkpoint", "data_root", "format", "class_map", "split", "samples"), "it takes the place of a data set"
 )
 _ONE_PROCESS = Excludes(("distributed", "coordinator"), "only xla runs in several processes")
-_WRITTEN = ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,15 +88,17 @@ class Evaluate:
 
 def run(args: Evaluate) -> None:
     """Detect if a detector is given, evaluate, write, and print the scores."""
-    check_processes(args.processes)
-    _check_written(args)
-    if _has_kitti_results(args):
+    is_folder = args.results is not None and args.results.is_dir() and args.ground_truth is None
+    if is_folder and args.data.data_set.reader.result_folders:
         return _score_kitti_results(args)
     join_processes(args.processes)
     is_main_process = jax.process_index() == 0
     with contextlib.ExitStack() as locked:
         with agreed("cannot evaluate"):
             task = _open(args)
+            results = args.out / task.comparison.file
+            if args.ground_truth is not None:
+                check_out_file("--out", results, keep=[args.ground_truth])
             # Given files are read and checked before anything is written.
             compared = None if args.results is None else task.comparison.read(args.results)
             if is_main_process:
@@ -107,8 +108,9 @@ def run(args: Evaluate) -> None:
             take_sigterm_back()
         with agreed("cannot evaluate"):
             if is_main_process:  # the others wait, because the first one would report their exit
-                compared = compared or task.comparison.read(args.out / task.comparison.file)
-                _copy(args, task)
+                compared = compared or task.comparison.read(results)
+                if (given := args.results) is not None and not (results.exists() and results.samefile(given)):
+                    atomic_write(results, lambda path: shutil.copyfile(given, path))
                 evaluation = write_scores(task, compared, args.out, bootstrap=args.bootstrap)
                 if args.rrd is not None:
                     write_recording(task, evaluation, args.rrd)
@@ -118,25 +120,14 @@ def run(args: Evaluate) -> None:
                 print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
 
 
-def _has_kitti_results(args: Evaluate) -> bool:
-    if args.results is None or args.ground_truth is not None:
-        return False
-    return (args.checkpoint is None or args.results.is_dir()) and args.data.data_set.reader.result_folders
-
-
 def _score_kitti_results(args: Evaluate) -> None:
     """Compute KITTI's metric of a folder of result files."""
     assert args.results is not None
-    if not args.results.is_dir():
-        expected = "the folder of KITTI's result files, or --checkpoint too, for the classes of detections.json"
-        raise ValueError(f"--results: {args.results}: found no folder, expected {expected}")
-    taken = {"data": DataOptions(args.data.data_root, args.data.format), "out": args.out, "report": args.report}
-    usual = Evaluate(**taken, split=args.split, results=args.results, processes=args.processes)
-    for given, expected in ((args.data, usual.data), (args, usual)):
-        for name in (field.name for field in dataclasses.fields(given) if field.name != "data"):
-            if (value := getattr(given, name)) != getattr(expected, name):
-                raise ValueError(f"{option_name(name)}: got {value}, expected none with a folder of results")
-    split = _split(args)
+    ignored = {name: getattr(args, name) for name in ("checkpoint", "samples", "bootstrap", "rrd")}
+    for name, value in (ignored | {"class_map": args.data.class_map}).items():
+        if value:
+            raise ValueError(f"{option_name(name)}: got {value}, expected none with a folder of results")
+    split = _split(args.data, args.split)
     frames = args.data.open_whole(split, CloudReading())
     assert isinstance(frames, KittiFrames)
     metrics = score_kitti(args.results, frames, of=f"split {split!r}" if split else str(frames.root))
@@ -146,80 +137,66 @@ def _score_kitti_results(args: Evaluate) -> None:
     print(f"look at {args.out / KITTI_SUMMARY}")
 
 
-def _copy(args: Evaluate, task: Task) -> None:
-    file, given = args.out / task.comparison.file, args.results
-    if given is not None and not (file.exists() and file.samefile(given)):
-        atomic_write(file, lambda path: shutil.copyfile(given, path))
-
-
-def _check_written(args: Evaluate) -> None:
-    """Reject a folder in which a file would replace an input. The results may be in it already."""
-    for name in (*_WRITTEN, *RESULT_FILES):
-        inputs = (args.ground_truth, None if name in RESULT_FILES else args.results)
-        check_out_file("--out", args.out / name, keep=[file for file in inputs if file is not None])
-
-
 def _open(args: Evaluate) -> Task:
-    """Open the detector and the data, and check that they fit together."""
+    """Open the detector and the truth."""
     detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
-    config = NUSCENES_SINGLE if detector is None else detector.config
     sensor = load_sensor(args.sensor) if detector is None else detector.sensor
     if args.ground_truth is not None:
         comparison = compare_by_benchmark(read_truth(args.ground_truth), str(args.ground_truth))
         return Task(args.ground_truth.name, comparison, sensor)
     data = args.data.data_set
-    if data.tables is None:
-        args.data.refuse_index("only the tables of nuScenes have an index")
-    official = detector is None or (set(detector.classes) <= set(NUSCENES_CLASSES) and args.data.class_map is None)
-    benchmark = data.tables is not None and official
-    _check_metric(args, detector, benchmark=benchmark)
-    split = _split(args)
+    has_benchmark = data.tables is not None and args.data.class_map is None
+    if detector is None and not has_benchmark:
+        expected = "--checkpoint too, for the classes of detections.json, or a folder of KITTI's result files"
+        raise ValueError(f"--results: {args.results}: expected {expected}")
+    split = _split(args.data, args.split)
     name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), data.version, split)))
-    if not benchmark:
-        frames = args.data.open(config, split=split, samples=args.samples, sensor=sensor)
-        if split is None and args.samples is None:
-            tell(f"{data.root}: no splits: evaluating all {len(frames)} frames; {_TOO_HIGH}")
-        if data.on_disk:  # damaged files are named now, and not after the detector was compiled
-            for index in range(len(frames)):
-                frames.labels(index)
-                frames.camera(index)  # reads the calibration of KITTI
-        own = frames.sensor  # the report's range images are in the frame of the data
-        if data.reader.sensor is None and (turn := radians(args.yaw_deg)) is not None:
-            own = dataclasses.replace(own, forward_rad=heading(sensor, turn))
-        # Only own data tell the number of rows: the frames of other formats have the rows of the detector's.
-        notes = () if data.reader.sensor else other_rows(frames.sensor, sensor)
-        if "full_turn" in data.reader.options:
-            unlabelled = "detections outside the camera image, where KITTI has no labels, lower mAP by distance"
-            notes += (unlabelled if args.data.full_turn else cropped(data.root),)
-        return Task(name, compare_by_distance(frames, config.ranges_m), own, detector, frames, notes)
-    frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
-    assert isinstance(frames, NuScenesFrames)
-    if args.samples is not None:
-        tokens = tuple(frames.tokens[i] for i in parse_ranges(args.samples, len(frames)))
-        frames = dataclasses.replace(frames, tokens=tokens)
-    truth = split_truth(frames.nuscenes, frames.tokens)
-    comparison = compare_by_benchmark(truth, name, config.classes, frames)
-    # Evaluating a results file needs only the tables.
-    only_boxes = detector is None and args.report and args.rrd is None
-    if only_boxes and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
-        tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
-        return Task(name, comparison, sensor)
-    return Task(name, comparison, frames.sensor, detector, frames)
+    if detector is None or (has_benchmark and set(detector.classes) <= set(NUSCENES_CLASSES)):
+        config = NUSCENES_SINGLE if detector is None else detector.config
+        frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
+        assert isinstance(frames, NuScenesFrames)
+        if args.samples is not None:
+            tokens = tuple(frames.tokens[i] for i in parse_ranges(args.samples, len(frames)))
+            frames = dataclasses.replace(frames, tokens=tokens)
+        comparison = compare_by_benchmark(
+            split_truth(frames.nuscenes, frames.tokens), name, config.classes, frames
+        )
+        # Evaluating a results file needs only the tables.
+        only_boxes = detector is None and args.report and args.rrd is None
+        if only_boxes and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
+            tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
+            return Task(name, comparison, sensor)
+        return Task(name, comparison, frames.sensor, detector, frames)
+    frames = args.data.open(detector.config, split=split, samples=args.samples, sensor=sensor)
+    if split is None and args.samples is None:
+        tell(f"{data.root}: no splits: evaluating all {len(frames)} frames; {_TOO_HIGH}")
+    return _compare_frames(name, frames, detector, args.data, radians(args.yaw_deg))
 
 
-def _split(args: Evaluate) -> str | None:
+def _compare_frames(
+    name: str, frames: MappedFrames, detector: CloudDetector, options: DataOptions, yaw_rad: float | None
+) -> Task:
+    """Data without a benchmark, whose damaged files are named now, and not after the detector was compiled."""
+    data, own = options.data_set, frames.sensor  # the report's range images are in the frame of the data
+    if data.on_disk:
+        for index in range(len(frames)):
+            frames.labels(index)
+            frames.camera(index)  # reads the calibration of KITTI
+    if data.reader.sensor is None and yaw_rad is not None:
+        own = dataclasses.replace(own, forward_rad=heading(detector.sensor, yaw_rad))
+    # Only own data tell the number of rows: the frames of other formats have the rows of the detector's.
+    notes = () if data.reader.sensor else other_rows(frames.sensor, detector.sensor)
+    if "full_turn" in data.reader.options:
+        unlabelled = "detections outside the camera image, where KITTI has no labels, lower mAP by distance"
+        notes += (unlabelled if options.full_turn else cropped(data.root),)
+    comparison = compare_by_distance(frames, detector.config.ranges_m)
+    return Task(name, comparison, own, detector, frames, notes)
+
+
+def _split(options: DataOptions, given: str | None) -> str | None:
     """The given split or the default, with a note if that is not a validation split."""
-    split = args.data.split("val", args.split)
-    if args.split is None and split not in (None, "val", "mini_val"):
+    split = options.split("val", given)
+    if given is None and split not in (None, "val", "mini_val"):
         only = f"no split val: evaluating {split}, the only split, which train uses too"
-        tell(f"{args.data.data_set.root}: {only}; {_TOO_HIGH}")
+        tell(f"{options.data_set.root}: {only}; {_TOO_HIGH}")
     return split
-
-
-def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: bool) -> None:
-    if benchmark and args.data.class_map is not None:
-        raise ValueError("--class-map: expected none with a results file, since the classes of nuScenes are fixed")
-    if benchmark and detector is not None and args.results is not None:
-        raise ValueError("--results: got --checkpoint too, expected one of them for nuScenes")
-    if not benchmark and detector is None:
-        raise ValueError("--results: expected --checkpoint too, for the classes of detections.json")

@@ -11,17 +11,13 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
-from fcos_lidar_jax.data.folder import belongs_to_own_data
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
-from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
-from fcos_lidar_jax.data.nuscenes.tables import SampleAnnotation, Scene, read_table
 from fcos_lidar_jax.fields import Count
-from fcos_lidar_jax.files import folder_lock, refusing
+from fcos_lidar_jax.files import check_writable, folder_lock, refusing
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import NUSCENES
@@ -56,19 +52,16 @@ def run(args: Prepare) -> None:
     folder = args.data.index or data.index
     more = "; name one by --index, here and for train"
     with refusing("--index", PermissionError, kind=PermissionError, more=more):
-        check_out_folder(folder, "--index")
-    if belongs_to_own_data(folder / "objects"):
-        raise ValueError(f"--index: {folder}: a folder of own data, expected another one")
+        check_writable(folder / ".lock")
     jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
-    split = _training_split(args, data)
     tell(f"writing to {folder}" + ("" if args.data.index else "; --index names another folder"))
     with folder_lock(folder, "preparing"):
-        record = _prepare(args, data, folder, split)
+        record = _prepare(args, data, folder)
     record["seconds"] = round(time.monotonic() - began, 1)
     print(json.dumps(record))
 
 
-def _prepare(args: Prepare, data: DataSet, folder: Path, split: str | None) -> dict[str, Any]:
+def _prepare(args: Prepare, data: DataSet, folder: Path) -> dict[str, Any]:
     record: dict[str, Any] = {"folder": str(folder)}
     if data.tables is not None:
         index = _make_index(data.tables, folder)
@@ -76,26 +69,13 @@ def _prepare(args: Prepare, data: DataSet, folder: Path, split: str | None) -> d
         record |= {"sweeps": len(index.sweep_file), "annotations": len(index.box_token)}
         if not record["annotations"]:
             return record
+    split = args.data.split("train", args.train_split)
     frames = args.data.open_whole(split, cut_reading(args.num_sweeps))
     progress = Progress("frames", len(frames))
     objects = objects_folder(folder, split)
     options = {name: getattr(args, name) for name in ("min_points", "num_sweeps", "workers")}
     database = prepare_database(frames, objects, **options, report=lambda done, _: progress.show(done))
     return record | {"train_split": split, "frames": len(frames), "objects": len(database)}
-
-
-def _training_split(args: Prepare, data: DataSet) -> str | None:
-    """The split to cut objects from, checked before the index of nuScenes is made, which takes minutes."""
-    tables = data.tables
-    if tables is None or not tables.is_dir():
-        return args.data.split("train", args.train_split)
-    if not any(read_table(tables, SampleAnnotation)):  # reads up to the first annotation
-        return None
-    split = args.data.split("train", args.train_split)
-    assert split is not None
-    scenes = {scene.name for piece in read_table(tables, Scene) for scene in piece}
-    scenes_of_split(split, tables, scenes, file=args.data.splits)
-    return split
 
 
 def _make_index(tables: Path, folder: Path) -> Index:

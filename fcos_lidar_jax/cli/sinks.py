@@ -47,12 +47,11 @@ def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Seq
         if not posed:
             raise ValueError(f"{option}: found no poses, expected some: the boxes are in the global frame")
     if args.output_format == "kitti":
-        if not any(name.lower() in _TYPES for name in classes):
-            raise ValueError(f"{option}: got the classes {', '.join(classes)}, expected some of KITTI's")
-        if len({_stem(cloud, number) for number, cloud in enumerate(clouds)}) < len(clouds):
+        stems = [_stem(cloud, number) for number, cloud in enumerate(clouds)]
+        if len(set(stems)) < len(stems):
             raise ValueError(f"{option}: got clouds of the same name, expected different names")
-        for number, cloud in enumerate(clouds):
-            read_calibration(_calibration(args.calibration, cloud, _stem(cloud, number)))
+        for cloud, stem in zip(clouds, stems, strict=True):
+            read_calibration(_calibration(args.calibration, cloud, stem))
         for file in sorted(args.out.glob("*.txt")):
             if any(len(line.split()) == _LABEL_COLUMNS for line in file.read_text(errors="replace").splitlines()):
                 raise ValueError(f"--out: {file}: found labels, which have no score, expected results or nothing")

@@ -227,8 +227,6 @@ class _Timing(contextlib.AbstractContextManager):
 
 def _find(args: Stream) -> Recording:
     """The kind of the drive; rejects options that do not fit it."""
-    if args.source is not None and not args.source.exists():
-        raise ValueError(f"{args.source}: no such file or folder")
     kind = find_recording(args.source or Path(), scene=args.scene, poses=args.poses)
     for field, name in _OPTIONS.items():
         if getattr(args, field) != getattr(Stream, field) and name not in kind.options:

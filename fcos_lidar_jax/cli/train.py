@@ -14,7 +14,7 @@ from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_
 from fcos_lidar_jax.cli.checks import Output, option_name
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
+from fcos_lidar_jax.cli.processes import ProcessOptions, join_processes
 from fcos_lidar_jax.config import Config, RefinementConfig
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
@@ -26,7 +26,7 @@ from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import ABOUT, PRESETS
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training import Schedule, train
-from fcos_lidar_jax.training.plan import RUN_SPEC, check_run, recorded_config
+from fcos_lidar_jax.training.plan import RUN_SPEC, recorded_config
 from fcos_lidar_jax.training.run import run_folder
 
 _PRESETS: Any = (
@@ -90,7 +90,6 @@ class Train:
 
 def run(args: Train) -> None:
     """Train, and print the paths of the run and its checkpoints."""
-    check_processes(args.processes)
     schedule = Schedule(args.save_every, args.evaluate_every, args.keep)
     join_processes(args.processes)
     is_main_process = jax.process_index() == 0
@@ -107,11 +106,11 @@ def run(args: Train) -> None:
                 # A run with other frames or options keeps its objects.
                 config = recorded_config(task.config, task.frames)
                 cut_from = {"config": config, "objects": task.frames.fingerprint()}
-                check_run(args.out, json.loads(json.dumps(cut_from)), resume=resume)
-                with run_folder(args.out, resume=resume):
-                    _cut_objects(args, task)
+                spec = json.loads(json.dumps(cut_from)) if resume else None
+                with run_folder(args.out, spec, resume=resume):
+                    _cut_objects(task)
         with agreed("cannot train"):
-            objects = _objects(args, task)
+            objects = _objects(task, args.data)
         state = train(
             task.config,
             task.frames,
@@ -137,12 +136,12 @@ def run(args: Train) -> None:
 @dataclasses.dataclass(frozen=True)
 class _Task:
     config: Config
-    data: DataSet
     split: str | None
     frames: FrameSet
     tests: FrameSet | None
     steps: int
-    cuts_objects: bool  # pasted objects come only from these frames and are stored in the run's folder
+    objects: Path  # folder of the objects to paste
+    cuts_objects: bool  # they come only from these frames and are stored in the run's folder
 
 
 def _open(args: Train) -> _Task:
@@ -151,7 +150,7 @@ def _open(args: Train) -> _Task:
         args.config,
         augment=None if args.no_augment else args.config.augment,
         copy_paste=None if args.no_copy_paste else args.config.copy_paste,
-        refinement=_refinement(args),
+        refinement=_refinement(args.config.refinement, args.second_look),
     )
     options = {"threads": args.threads, "workers": args.workers, "num_processes": jax.process_count()}
     check_loader_options(config, **options)  # before objects are cut
@@ -165,7 +164,7 @@ def _open(args: Train) -> _Task:
     if absent := [name for name in config.classes if name not in frames.frames.classes]:
         known = ", ".join(frames.frames.classes)
         tell(f"warning: --classes: the data have no example of {', '.join(absent)}, only of {known}")
-    tests = _open_tests(args, config, data.root)
+    tests = _open_tests(args, config)
     if split is None and args.samples is None and tests is None:
         tell(f"{data.root}: no splits: training on all {len(frames)} frames, with no evaluation")
     if tests is not None:
@@ -178,15 +177,14 @@ def _open(args: Train) -> _Task:
         _check_simulated(len(frames), config)
     steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
     cuts_objects = config.copy_paste is not None and (args.samples is not None or not data.on_disk)
-    if data.tables is None and (config.copy_paste is None or cuts_objects):
-        args.data.refuse_index("no prepared objects are used")
-    return _Task(config, data, split, frames, tests, steps, cuts_objects)
+    objects = args.out / _OBJECTS if cuts_objects else database.objects_folder(index, split)
+    return _Task(config, split, frames, tests, steps, objects, cuts_objects)
 
 
-def _refinement(args: Train) -> RefinementConfig | None:
-    if args.second_look is None:
-        return args.config.refinement
-    return None if args.second_look == "off" else args.config.refinement or RefinementConfig()
+def _refinement(of_preset: RefinementConfig | None, second_look: str | None) -> RefinementConfig | None:
+    if second_look is None:
+        return of_preset
+    return None if second_look == "off" else of_preset or RefinementConfig()
 
 
 def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
@@ -196,46 +194,39 @@ def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
     check(fits, "--sensor", config.sensor, f"none: {data.root}/sensor.json has {frames.sensor.name!r}")
 
 
-def _open_tests(args: Train, config: Config, root: Path) -> FrameSet | None:
+def _open_tests(args: Train, config: Config) -> FrameSet | None:
     split = args.data.split("val", args.val_split, required=False)
     if split != "none" and (split is not None or args.val_samples):
         return args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
-    off = f", expected --val-split or --val-samples too: {root} has no split to evaluate on"
-    if split == "none":
-        off = " with --val-split none, which turns evaluation off"
     for name in ("val_samples", "evaluate_every"):
         if (given := getattr(args, name)) is not None:
-            raise ValueError(f"{option_name(name)}: got {given!r}{off}")
+            raise ValueError(f"{option_name(name)}: got {given!r}, expected a split to evaluate on (--val-split)")
     return None
 
 
 def _check_simulated(number: int, config: Config) -> None:
     """Reject options that would simulate very many frames before the first step."""
-    costly = {"--no-class-balanced": config.class_balanced, "--no-copy-paste": config.copy_paste is not None}
-    if number > _MAX_SIMULATED and any(costly.values()):
-        options = " ".join(name for name, is_on in costly.items() if is_on)
+    if number > _MAX_SIMULATED and (config.class_balanced or config.copy_paste is not None):
+        expected = f"--no-class-balanced --no-copy-paste, or at most {_MAX_SIMULATED} of them by --samples"
         raise ValueError(
-            f"--format simulated: all {number} frames would be made before the first step, expected {options}, or "
-            f"at most {_MAX_SIMULATED} of them by --samples"
+            f"--format simulated: all {number} frames would be made before the first step, expected {expected}"
         )
 
 
-def _cut_objects(args: Train, task: _Task) -> None:
+def _cut_objects(task: _Task) -> None:
     assert task.config.copy_paste is not None
     min_points, num_sweeps = task.config.copy_paste.min_points, task.config.num_sweeps
-    folder = args.out / _OBJECTS
-    database.prepare_database(task.frames, folder, min_points=min_points, num_sweeps=num_sweeps)
+    database.prepare_database(task.frames, task.objects, min_points=min_points, num_sweeps=num_sweeps)
 
 
-def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
+def _objects(task: _Task, data: DataOptions) -> database.GroundTruthDatabase | None:
     """Open the objects to paste, just cut or prepared for the split; None without copy-paste."""
-    config, split = task.config, task.split
-    if config.copy_paste is None:
+    folder, split = task.objects, task.split
+    if task.config.copy_paste is None:
         return None
     if task.cuts_objects:
         # The folder is not locked since they were cut: another process may have cut others.
-        return database.open_database(args.out / _OBJECTS, fingerprint=task.frames.fingerprint())
-    folder = database.objects_folder(args.data.index or task.data.index, split)
+        return database.open_database(folder, fingerprint=task.frames.fingerprint())
     if not folder.is_dir():
         option = "" if split is None else f" --train-split {split}"
         raise ValueError(
@@ -244,7 +235,7 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
         )
     objects = database.open_database(folder)
     reading = database.cut_reading(objects.manifest.num_sweeps)
-    if objects.manifest.source != args.data.open_whole(split, reading, report_missing=False).fingerprint():
+    if objects.manifest.source != data.open_whole(split, reading, report_missing=False).fingerprint():
         of = "all frames" if split is None else f"split {split!r}"
         raise ValueError(
             f"{folder}: cut from other frames than {of}, or with other options, such as --class-map or "

@@ -29,9 +29,9 @@ def draw_drive(
     classes: Sequence[str],
     title: str,
     limit_m: float,
-    report: Callable[[int], object] = lambda done: None,
-) -> list[Path]:
-    """Write an animated GIF, and one PNG file per scene beside it, ``NAME_00.png`` and so on; returns these files.
+    report: Callable[[int], object],
+) -> None:
+    """Write an animated GIF, and one PNG file per scene beside it, ``NAME_00.png`` and so on.
 
     The top shows the range image, with the forward direction in the middle. Below is the bird's-eye view with
     detections and dashed truth, in a square with half the side ``limit_m``. ``title`` begins the title of each
@@ -63,7 +63,6 @@ def draw_drive(
         report(number + 1)
     options: Any = {"save_all": True, "append_images": pictures[1:], "loop": 0, "duration": 1e3 * _SCENE_S}
     atomic_write(path, lambda out: pictures[0].save(out, "GIF", **options))
-    return files
 
 
 def _draw_ranges(axis: Any, points: np.ndarray, size: int, sensor: Sensor) -> None:

@@ -21,7 +21,7 @@ from fcos_lidar_jax.visualization.bev import draw_bev
 from fcos_lidar_jax.visualization.camera import draw_camera
 from fcos_lidar_jax.visualization.figure import LINE_COLORS, new_axis, save_png
 from fcos_lidar_jax.visualization.range_image import draw_range_image
-from fcos_lidar_jax.visualization.report import Cell, Picture, write_report
+from fcos_lidar_jax.visualization.report import Cell, Picture, Table, write_report
 
 ERROR_NAMES = {
     "trans_err": ("ATE", "translation [m]"),
@@ -127,7 +127,7 @@ def write_evaluation_report(
     )
 
 
-def _kitti_table(file: Path) -> list[tuple[str, tuple[str, ...], list[tuple[Cell, ...]]]]:
+def _kitti_table(file: Path) -> list[Table]:
     if not file.is_file():
         return []
     metrics = json.loads(file.read_text())

@@ -1,6 +1,8 @@
 """Recording of a drive for the rerun viewer (extra ``viz``)."""
 
 import contextlib
+import functools
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,15 +10,10 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
-from fcos_lidar_jax.files import atomic_path, import_extra
+from fcos_lidar_jax.files import atomic_path
 from fcos_lidar_jax.visualization.figure import class_color
 
 _HIGH_M = 4.0  # height above ground at the end of the colour scale
-
-
-def check_rerun() -> None:
-    """Refuse a recording if rerun is not installed."""
-    import_extra("rerun", "viz", "--rrd: ")
 
 
 @contextlib.contextmanager
@@ -33,10 +30,8 @@ def rerun_recording(
     with atomic_path(path) as temporary:
         recording = rr.RecordingStream("fcos_lidar_jax")
         recording.save(temporary)
-        number = iter(range(2**63))
         with recording:
-            fixed = recording, number, classes, min_score
-            yield lambda *given, **named: _record(*fixed, *given, **named)
+            yield functools.partial(_record, recording, itertools.count(), classes, min_score)
         recording.disconnect()
 
 

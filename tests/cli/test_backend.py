@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import command, run_python
-from tiny_run import TINY_CONFIG, untrained
+from tiny_run import save_untrained
 
-from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -22,7 +21,7 @@ pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not insta
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("backend")
-    save_checkpoint(folder / "checkpoint", Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 7))
+    save_untrained(folder / "checkpoint")
     (folder / "clouds").mkdir()
     for seed in range(2):
         np.save(folder / "clouds" / f"{seed}.npy", make_frame(seed, TINY).points)

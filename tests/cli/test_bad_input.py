@@ -10,9 +10,8 @@ import pytest
 from commands import assert_one_line_error, command, contents, in_use, mistakes
 from made_kitti import calibration_text
 from made_nuscenes import VERSION, make_tables, write
-from tiny_run import TINY_CONFIG, untrained
+from tiny_run import TINY_CONFIG, save_untrained
 
-from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -21,8 +20,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 def home(tmp_path_factory):
     """Clouds, poses, a checkpoint, its export and a data set in the nuScenes layout."""
     folder = tmp_path_factory.mktemp("home")
-    checkpoint = Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 7)
-    save_checkpoint(folder / "checkpoint", checkpoint)
+    save_untrained(folder / "checkpoint")
     command("export --checkpoint", folder / "checkpoint", "--out", folder / "detector.fcos")
     points = make_frame(0, TINY).points
     drive = folder / "training" / "velodyne"
@@ -31,7 +29,6 @@ def home(tmp_path_factory):
         np.save(place, points)
     np.save(folder / "away.npy", points + np.array([500, 500, 0, 0, 0], np.float32))
     np.save(folder / "no_rows.npy", points[:0])
-    np.save(folder / "scaled_ring.npy", np.column_stack([points[:, :4], np.arange(len(points)) % 16 / 15]))
     (folder / "link.json").symlink_to("good.npy")
     (folder / "a.bag").touch()
     (folder / "calibration.txt").write_text(calibration_text())
@@ -40,7 +37,9 @@ def home(tmp_path_factory):
     entry = {"sensor_to_world": np.eye(4).tolist()}
     poses = [{**entry, "file": f"training/velodyne/{i}.npy", "timestamp_us": 50_000 * i} for i in (1, 0)]
     (folder / "poses.json").write_text(json.dumps(poses))
-    (folder / "truth.json").write_text('{"a": {"ego_translation": [0, 0, 0], "boxes": []}}')
+    (folder / "truth").mkdir()
+    for place in (folder / "truth.json", folder / "truth" / "results_nusc.json"):
+        place.write_text('{"a": {"ego_translation": [0, 0, 0], "boxes": []}}')
     (folder / "results_nusc.json").write_text('{"meta": {}, "results": {"a": []}}')
     write(folder / "data", *make_tables(1))
     return folder
@@ -53,19 +52,10 @@ detect HOME/good.npy --sweeps HOME/poses.json => --sweeps: got .*, expected none
 detect HOME/good.npy HOME/none.npy => none.npy: no such file
 detect HOME/away.npy HOME/no_rows.npy => away.npy: none of its .* points is usable
 detect HOME/training => training: no point file in it, expected [^;]*$
-detect HOME/scaled_ring.npy => scaled_ring.npy: fifth column: got 16 different .* 1 \(num_sweeps\): .*--columns
-detect HOME/good.npy --viewpoint => good.npy: viewpoint: expected a .pcd file
 detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
 detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, 
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
-detect --sweeps HOME/s.json => s.json: no such file
-detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
-detect --sweeps HOME/s.json --full-turn => --sweeps: got .*, expected none with --full-turn: 
-detect HOME/good.npy --full-turn => --full-turn: expected none for .*good.npy: only files of KITTI are cropped
 detect HOME/good.npy --min-score 50 => --min-score: got 50.0, expected within \[0, 1\]$
-detect HOME/good.npy --yaw-deg nan => --yaw-deg: got nan, expected within \[-360, 360\]$
-detect HOME/good.npy --batch-size 0 => --batch-size: got 0, expected at least 1$
-detect HOME/good.npy --data-sensor sonar => sonar: no such file, expected a sensor
 detect HOME/good.npy --labels submarine => --labels: got 'submarine', expected some of
 detect HOME/good.npy --calibration HOME => --calibration: got .*, expected only with --output-format kitti$
 detect HOME/good.npy --output-format kitti => good.txt: no such file, expected --calibration
@@ -78,74 +68,44 @@ detect HOME/good.npy gs://b/run => gs://b/run: got a URL, expected a path: copy
 detect HOME/none.npy --out HOME/link.json => link.json: found a link to .*good
 detect HOME/none.npy --out HOME/good.npy/x => good.npy: found a file, expected a fol
 detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*the place of the checkpoint
-detect HOME/good.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos => the place of the checkpoint
 detect HOME/good.npy --checkpoint HOME/detector.fcos --batch-size 2 => batch size: got 2, expected 1
-detect HOME/none.npy --pictures HOME/good.npy => --pictures: .*: found a file, expect
+detect HOME/none.npy --pictures HOME/good.npy => good.npy: found a file, expected a folder
 stream => SOURCE: got none, expected one, or --data-root$
-stream HOME --data-root HOME --scene a => --data-root: .*, expected none with SOURCE: it takes the place of SOURCE
-stream HOME/nowhere => nowhere: no such file or folder
+stream HOME/nowhere => nowhere: no such file, expected a point file
 stream HOME/training/velodyne --track => --track: found no poses
-stream HOME/good.npy --checkpoint HOME/detector.fcos --out HOME/detector.fcos => the place of the checkpoint
 stream HOME/training/velodyne --keyframes => --keyframes: expected only with --data-root
-stream HOME/training/velodyne --min-score 2 => --min-score: got 2.0, expected
-stream HOME/training/velodyne --poses HOME/poses.json --out HOME/poses.json => --out: .*the same file as
 stream HOME/training/velodyne --output-format nuscenes => --output-format nuscenes: found no poses
 stream HOME/a.bag --odometry tf --poses HOME/poses.json => --poses: got .*, expected none with --odometry: a drive
-stream HOME/a.bag --columns 4 => --columns: expected only with a folder of point files
 stream --data-root HOME => --data-root: got .*, expected only with --scene$
 stream --data-root HOME --scene a --intensity-scale 9 => --intensity-scale: got 9.0, expected none with
-stream --data-root HOME/data --scene a => expected
 stream --data-root HOME/data --scene scene-0 --output-format nuscenes => expected --keyframes with --data-root
 evaluate => --checkpoint: got none, expected one, or --results$
 evaluate --results HOME/truth.json => data root: missing, expected the folder of a data set
 evaluate --checkpoint x --ground-truth HOME/truth.json => --ground-truth: .* expected none with --checkpoint
-evaluate --results x --split val --ground-truth HOME/truth.json => --ground-truth: .* expected none with --split
-evaluate --results x --ground-truth HOME/truth.json --bootstrap -1 => --bootstrap: got -1, expected at least 0
 evaluate --results x --ground-truth HOME/truth.json --batch-size 2 => --results: .* none with --batch-size
-evaluate --results x --ground-truth HOME/results_nusc.json --out HOME => --out: .*results_nusc.json: the same file
-evaluate DATA --results x --class-map y => --class-map: expected none with a results file
-evaluate DATA --results x --checkpoint HOME/checkpoint => --results: got --checkpoint too, expected one of
-evaluate DATA --results x --split other => split 'other': not found
+evaluate --results x --ground-truth HOME/truth/results_nusc.json --out HOME/truth => --out: .*: the same file as
+evaluate DATA --results x --class-map y => --results: x: expected --checkpoint too, for the classes
 evaluate DATA --checkpoint HOME/checkpoint --sensor tiny => --sensor: got tiny, expected none with --checkpoint
 evaluate DATA --checkpoint quickstart --out quickstart => --out: quickstart: the place of the checkpoint, expected
 evaluate DATA --checkpoint quickstart --coordinator a:1 => --coordinator: got a:1, expected only with --num-
-evaluate DATA --checkpoint quickstart --coordinator a --num-processes 2 --process-index 0 => expected HOST:PORT
-evaluate DATA --checkpoint quickstart --coordinator a:1 --num-processes 2 --process-index 2 => index: got 2
 evaluate DATA --distributed --results x => --results: got x, expected none with --distributed: nothing is detected
 evaluate DATA --distributed --checkpoint quickstart --backend openvino => --backend: got openvino, expected none
-evaluate --format simulated --checkpoint HOME/checkpoint --version v1 => version: got v1, expected none
-train quickstart --format simulated --out gs://b/run => gs://b/run: got a URL, expected a path: copy
 train quickstart --data-root gs://b/run => gs://b/run: got a URL, expected a path: copy
 train quickstart --format simulated => all 100000 frames .* --no-class-balanced --no-copy-paste, or at most
-train quickstart --format simulated --no-copy-paste => all 100000 frames .* --no-class-balanced, or at most 2000
 train quickstart DATA --train-split all --val-split none => made: no index here, .* run fcos-lidar prepare$
-train quickstart --data-root HOME/none => none: no such folder
-train quickstart --format simulated --num-processes 2 => --num-processes: got 2, expected only with --process-index
-prepare DATA --train-split other --index OUT => split 'other': not found
 prepare --format simulated --index OUT => simulated frames need no preparation
-prepare DATA --index OUT --workers 0 => --workers: got 0, expected at least 1
-project HOME/good.npy --sensor gs://b/run => gs://b/run: got a URL, expected a path: copy
-project HOME/good.npy --rounds 100000 => --rounds: got 100000, expected within \[1, 100\]$
 project HOME/away.npy => away.npy: none of its
 project HOME/good.npy --png HOME/good.npy => --png: .*the same file as
 synthesize --scenes 1 --sensor argoverse2 => --sensor: got argoverse2, whose rows come from laser numbers
-synthesize --scenes 0 => --scenes: got 0, expected at least 1
-synthesize --scenes 1 --seed -1 => --seed: got -1, expected at least 0
 synthesize --scenes 1 --version samples => --version: got 'samples', expected a name for the folder of the tables
 synthesize --scenes 1 --version ../a => --version: got '../a', expected a name for the folder of the tables
-export --checkpoint gs://b/run => gs://b/run: got a URL, expected a path: copy
 export --checkpoint HOME/checkpoint --out HOME => found a folder
-export --checkpoint HOME/checkpoint --out HOME/checkpoint/a => the place of the checkpoint
 export --checkpoint HOME/detector.fcos => found a file, expected a checkpoint folder
 export --checkpoint HOME/checkpoint --network-only => --network-only: got True, expected only with --format onnx$
-export --checkpoint HOME/checkpoint --format onnx --batch 2 => --batch: got 2, expected only with --format jax$
 benchmark --checkpoint HOME/checkpoint --batch 0 => --batch: got \(0,\), expected at least 1
 benchmark --checkpoint HOME/detector.fcos --batch 2 => batch size: got 2
 benchmark --checkpoint HOME/detector.fcos --backend openvino => found a file, expected a checkpoint folder
-benchmark --checkpoint HOME/detector.fcos --out HOME/detector.fcos => the place of the checkpoint
-demo --keyframes 0 => --keyframes: got 0
-demo --out gs:/b/run => gs://b/run: got a URL, expected a path: copy
-demo --out HOME/good.npy => --out: .*: found a file
+demo --out HOME/good.npy => good.npy: found a file, expected a folder
 """)
 
 
@@ -189,7 +149,7 @@ def test_recordings_need_rerun(home, tmp_path, capsys, monkeypatch, line):
 
 def test_other_classes_are_not_of_nuscenes(home, tmp_path, capsys):
     other = dataclasses.replace(TINY_CONFIG, classes=("hovercraft", *TINY_CONFIG.classes[1:]))
-    save_checkpoint(tmp_path / "other", Checkpoint(other, TINY, untrained(other, TINY), 7))
+    save_untrained(tmp_path / "other", other)
     words = ["detect", "--sweeps", str(home / "poses.json"), "--output-format", "nuscenes", "--checkpoint"]
     words += [str(tmp_path / "other"), "--out", str(tmp_path / "out")]
     assert_one_line_error(capsys, words, "nuscenes: got the classes hovercraft, expected only")

@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 from commands import command
-from tiny_run import TINY_CONFIG, untrained
+from tiny_run import save_untrained
 
-from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -15,7 +14,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("benchmark")
-    save_checkpoint(folder / "checkpoint", Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 7))
+    save_untrained(folder / "checkpoint")
     command("export --checkpoint", folder / "checkpoint", "--out", folder / "detector.fcos")
     for seed in range(2):
         np.save(folder / f"{seed}.npy", make_frame(seed, TINY).points)

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from commands import page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
-from tiny_run import TINY_CONFIG, untrained
+from tiny_run import save_untrained
 
-from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.evaluate import Evaluate, run
@@ -39,7 +38,7 @@ def home(tmp_path_factory):
         file.parent.mkdir(parents=True, exist_ok=True)
         make_frame(i, TINY).points.tofile(file)
     (folder / "truth.json").write_text(json.dumps(truth_of(tables)))
-    save_checkpoint(folder / "checkpoint", Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 0))
+    save_untrained(folder / "checkpoint")
     return folder
 
 

@@ -38,14 +38,9 @@ def fail_with(error):
         (RecursionError("maximum recursion depth"), "nested too deeply: expected a file or an option with fewer"),
         (MemoryError(), "out of memory: for training, --optimizer.accumulate"),
         (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: for training, --optimizer.accumulate"),
-        (RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"), "another process ended, see its output: UNK"),
         (
-            RuntimeError("Gloo context initialization failed: Read error"),
-            "the connection between the processes failed: G",
-        ),
-        (
-            RuntimeError("Gloo AllGather failed: Timed out"),
-            "the connection between the processes failed: Gloo AllGather",
+            RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
+            "another process ended, see its output, or the",
         ),
         (ValueError("x" * 120_000), "x" * 900),
     ],
@@ -75,33 +70,20 @@ PLATFORM = "expected a platform of this machine, or, for NVIDIA GPUs, pip instal
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "error", "message"),
+    ("name", "value", "error"),
     [
-        ("JAX_PLATFORMS", "cuda", AssertionError(), f"JAX_PLATFORMS: got 'cuda', {PLATFORM}"),
-        (
-            "JAX_PLATFORMS",
-            "x",
-            RuntimeError("Unable to initialize backend 'x'"),
-            f"JAX_PLATFORMS: got 'x', {PLATFORM}",
-        ),
-        (
-            *("JAX_PLATFORM_NAME", "gpu", RuntimeError("Unknown backend: 'gpu' requested")),
-            f"JAX_PLATFORM_NAME: got 'gpu', {PLATFORM}",
-        ),
-        (
-            *("JAX_TRANSFER_GUARD", "disallow", RuntimeError("Disallowed host-to-device transfer")),
-            "the environment has JAX_TRANSFER_GUARD=disallow, which makes JAX refuse more than usual: Disallowed",
-        ),
-        ("JAX_DEBUG_NANS", "1", FloatingPointError("nan in jit"), "the environment has JAX_DEBUG_NANS=1, which"),
-        ("JAX_DEBUG_NANS", "1", ValueError("a.npy: no such file"), "a.npy: no such file"),
+        ("JAX_PLATFORMS", "cuda", AssertionError()),
+        ("JAX_PLATFORMS", "x", RuntimeError("Unable to initialize backend 'x'")),
+        ("JAX_PLATFORM_NAME", "gpu", RuntimeError("Unknown backend: 'gpu' requested")),
     ],
 )
-def test_what_the_environment_of_jax_breaks_is_no_bug(capsys, monkeypatch, name, value, error, message):
+def test_a_platform_that_jax_lacks_is_no_bug(capsys, monkeypatch, name, value, error):
+    for each in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(name, value)
-    monkeypatch.delenv("JAX_PLATFORMS" if name != "JAX_PLATFORMS" else "JAX_PLATFORM_NAME", raising=False)
     monkeypatch.setattr("jax.devices", fail_with(AssertionError()))
     assert exit_code("program", fail_with(error)) == 1
-    assert capsys.readouterr().err.startswith(f"program: error: {message}")
+    assert capsys.readouterr().err.startswith(f"program: error: {name}: got {value!r}, {PLATFORM}")
 
 
 @pytest.mark.slow

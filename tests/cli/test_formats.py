@@ -13,7 +13,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from commands import command
-from linear_network import linear_network
 from made_argoverse2 import make_argoverse2
 from made_folder import make_folder
 from made_kitti import make_kitti
@@ -86,14 +85,10 @@ def test_every_format_is_tried():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("linear")
 @pytest.mark.parametrize("make", MAKERS)
 def test_prepares_trains_evaluates_and_detects(make, tmp_path, capsys):
     """The network does not depend on the format; ``tests/training`` trains FCOS-LiDAR's."""
-    with linear_network():
-        prepare_train_evaluate_and_detect(make, tmp_path, capsys)
-
-
-def prepare_train_evaluate_and_detect(make, tmp_path, capsys):
     data, preset, cloud, classes = make(tmp_path / "data")
     run, scores, boxes = tmp_path / "run", tmp_path / "scores", tmp_path / "boxes.json"
     if make is not simulated:

@@ -75,34 +75,9 @@ def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_p
     ):
         assert_one_line_error(capsys, [*args, *name, *sensor], message)
     (tmp_path / "data" / "splits.json").unlink()
-    message = "--evaluate-every: got 4, expected --val-split or --val-samples too: .*data has no split to evaluate"
+    message = "--evaluate-every: got 4, expected a split to evaluate on"
     assert_one_line_error(capsys, [*args, "--evaluate-every", "4"], message)
     assert not (tmp_path / "out").exists()
-
-
-def test_objects_of_changed_frames_without_splits_are_refused(tmp_path, capsys):
-    data = make_folder(tmp_path / "data", train=1, val=0)
-    (data / "splits.json").unlink()
-    command("prepare --data-root", data)
-    np.save(data / "clouds" / "000.npy", np.load(data / "clouds" / "000.npy")[1:])
-    train = (
-        f"train quickstart --data-root {data} --out {tmp_path}/out --copy-paste.targets 2 2 2 --steps 1 --classes"
-    )
-    message = "all_frames: cut from other frames than all frames, or with other options, .* or --full-turn"
-    assert_one_line_error(capsys, [*train.split(), *CLASSES], message)
-
-
-def test_an_index_is_refused_where_it_would_be_ignored_or_spoil_the_data(tmp_path, capsys):
-    data = make_folder(tmp_path / "data", train=1, val=1)
-    spoilt = f"prepare --data-root {data} --index {data}/clouds".split()
-    assert_one_line_error(capsys, spoilt, "--index: .*clouds: a folder of own data, expected another one")
-    more = f"--data-root {data} --out {tmp_path}/out --index {tmp_path}/index"
-    train = f"train quickstart {more} --steps 1 --no-copy-paste --classes".split()
-    assert_one_line_error(capsys, [*train, *CLASSES], "--index: got .*, expected none: no prepared objects")
-    evaluate = f"evaluate {more} --checkpoint quickstart".split()
-    assert_one_line_error(capsys, evaluate, "--index: got .*, expected none: only the tables of nuScenes have an")
-    assert [path.name for path in tmp_path.iterdir()] == ["data"]
-    assert {path.suffix for path in (data / "clouds").iterdir()} == {".npy"}
 
 
 def test_classes_that_the_data_do_not_have_are_named_in_a_warning(tmp_path, capsys):

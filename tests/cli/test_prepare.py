@@ -3,11 +3,10 @@
 import json
 import os
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
-from commands import assert_one_line_error, command, contents, cut, run_python
+from commands import assert_one_line_error, command, contents, cut
 from kills import killed_twice
 from made_nuscenes import VERSION, make_tables, write
 
@@ -56,21 +55,6 @@ def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     assert len(states - {(), tuple(expected)}) >= 4  # kills at different stages
 
 
-def test_objects_come_only_from_the_training_split(root, tmp_path):
-    command(*prepare(root, tmp_path / "i", "--train-split", "scene-1"))
-    objects = open_database(tmp_path / "i" / "objects" / "scene-1")
-    data = NuScenes(root, VERSION)
-    own, other = (
-        {box.tobytes() for token in data.split(split) for box in data.boxes(token).boxes}
-        for split in ("scene-1", "scene-2")
-    )
-    boxes = {row["box"].tobytes() for row in objects.table}
-    assert len(boxes) == len(objects) > 4
-    assert boxes <= own
-    assert not boxes & other
-    assert [shard.name for shard in objects.manifest.shards] == ["scene-1"]
-
-
 def change_tables(root: Path, index: Path) -> None:
     file = root / VERSION / "sample_annotation.json"
     rows = json.loads(file.read_text())
@@ -117,23 +101,3 @@ def test_a_version_without_annotations_only_gets_an_index(root, tmp_path, capsys
     assert (record["annotations"], "objects" in record) == (0, False)
     assert not (tmp_path / "i" / "objects").exists()
     assert len(NuScenes(copy, VERSION, index=tmp_path / "i").sample_tokens) == 4 * SCENES
-
-
-@pytest.mark.slow
-def test_a_full_disk_gets_one_line_and_nothing_half_written(root, tmp_path):
-    small = tmp_path / "small"
-    small.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=152k", "t", str(small)]
-    if os.geteuid() or subprocess.run(mount, check=False, stderr=subprocess.DEVNULL).returncode:
-        pytest.skip("no right to mount a small tmpfs")
-    try:
-        done = run_python("-m", "fcos_lidar_jax", *prepare(root, small / "i"))
-        left = [file for file in small.rglob(".*") if file.name != ".lock"]
-        manifests = {file.name for file in small.rglob("*.json")}
-    finally:
-        subprocess.run(["umount", small], check=True)
-    assert done.returncode == 1
-    assert done.stderr.strip().splitlines()[-1].startswith("fcos-lidar: error: ")
-    assert "No space left on device" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert (left, manifests) == ([], {"index.json"})

@@ -32,15 +32,10 @@ def home(tmp_path_factory):
     """An untrained detector, and a drive of three clouds in KITTI's layout, with poses and calibrations."""
     home = tmp_path_factory.mktemp("home")
     variables = untrained(CONFIG, TINY)
-    classification, regression = (
-        variables["params"]["heads"]["shared"][f] for f in ("classification", "regression")
-    )
-    for name, head in (
-        ("logits_kernel", classification),
-        ("logits_bias", classification),
-        ("iou_bias", regression),
-    ):
-        head[name] *= 0  # so that it finds boxes of two classes
+    heads = variables["params"]["heads"]["shared"]
+    classification, regression = heads["classification"], heads["regression"]
+    for each in (classification["logits_kernel"], classification["logits_bias"], regression["iou_bias"]):
+        each *= 0  # so that it finds boxes of two classes
     regression["size_kernel"] *= 0.05
     save_checkpoint(home / "checkpoint", Checkpoint(CONFIG, TINY, variables, 7))
     (home / "training" / "velodyne").mkdir(parents=True)
@@ -124,12 +119,8 @@ def test_a_drive_in_openlabel(home, lines, tmp_path):
 
 def test_clouds_in_openlabel_have_objects_of_their_own(home, lines, tmp_path):
     clouds = [home / "training" / "velodyne" / f"{number:06d}.npy" for number in range(2)]
-    how = (
-        "--checkpoint",
-        home / "checkpoint",
-        "--min-score 0.001 --output-format openlabel --labels truck bus --out",
-    )
-    command("detect", *clouds, *how, tmp_path / "labels.json")
+    how = "--min-score 0.001 --output-format openlabel --labels truck bus --out", tmp_path / "labels.json"
+    command("detect", *clouds, "--checkpoint", home / "checkpoint", *how)
     content = json.loads((tmp_path / "labels.json").read_text())["openlabel"]
     assert content["coordinate_systems"] == {"lidar": {"type": "sensor_cs", "parent": "", "children": []}}
     expected = [[box for box in line["boxes"] if box["label"] in ("truck", "bus")] for line in lines[:2]]
@@ -230,15 +221,12 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monk
 
 def test_files_of_own_data_are_not_overwritten(home, tmp_path, capsys):
     call = ["detect", str(home / "training" / "velodyne"), "--checkpoint", str(home / "checkpoint"), "--out"]
-    (tmp_path / "clouds").mkdir()
-    places = ["boxes/000.json", "sweeps/000.json", "splits.json"]
-    for out in map(tmp_path.joinpath, places):
-        assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
-        assert not out.exists()
-    out = tmp_path / "clouds" / "a.npy"
-    command(*call, out)  # not own data yet: any folder may be called clouds
-    (tmp_path / "boxes").mkdir()
-    assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
+    for folder in ("clouds", "boxes"):
+        (tmp_path / folder).mkdir()
+    for out in ("boxes/000.json", "sweeps/000.json", "splits.json", "clouds/a.npy"):
+        message = "the place of a file of own data, expected another one"
+        assert_one_line_error(capsys, [*call, str(tmp_path / out)], message)
+        assert not (tmp_path / out).exists()
 
 
 def test_detect_and_evaluate_write_recordings(home, tmp_path):

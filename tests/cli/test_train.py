@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from commands import assert_one_line_error, command, free_port, in_use, mistakes, wait_until
 from forked import Forked
-from linear_network import linear_network, use
+from linear_network import use
 from tiny_run import NETWORK_OPTIONS, STEPS
 
 from fcos_lidar_jax import cli
@@ -34,15 +34,8 @@ def train(root: Path, out: Path, *more: str) -> list[str]:
     return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often, *tests, *more]
 
 
-@pytest.fixture
-def _linear():
-    """tests/training trains FCOS-LiDAR's network."""
-    with linear_network():
-        yield
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("_linear")
+@pytest.mark.usefixtures("linear")
 def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys):
     start, out = root.parent / "linear", tmp_path / "run"
     options = ["--samples", "1:2", "--copy-paste.min-points", "3", "--second-look", "on"]
@@ -169,18 +162,13 @@ def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, 
 
 BAD = mistakes(r"""
 --keep 0 => keep: got 0
---version v9 => v9: no such folder
 --train-split other => split 'other': not found
 --val-split other => split 'other': not found
---train-split= => split '': not found
---splits gone.json => gone.json: no such file
 --samples 1 => --samples: got '1', expected FIRST:LAST with FIRST < LAST within the 6 frames, without overlap$
 --samples 0:2,1:2 => --samples: got '1:2', expected
 --val-samples 2:2 => --val-samples: got '2:2', expected
---resume => run.json: found nothing, expected the run to resume
---weights gone => gone: found nothing, expected a checkpoint folder
---val-split none --evaluate-every 4 => --evaluate-every: got 4 with --val-split none, which turns evaluation off
---val-split none --val-samples 0:1 => --val-samples: got '0:1' with --val-split none, which turns evaluation off
+--val-split none --evaluate-every 4 => --evaluate-every: got 4, expected a split to evaluate on
+--val-split none --val-samples 0:1 => --val-samples: got '0:1', expected a split to evaluate on
 --optimizer.accumulate 3 => --optimizer.accumulate: got 3, expected a divisor of the batch size 2$
 --model.stem.channels-per-type 0 => --model.stem.channels-per-type: got 0, expected at least 1$
 --num-sweeps 2 => num_sweeps: got 2, expected at most the 1 of .*/train: run fcos-lidar prepare --num-sweeps 2$
@@ -209,7 +197,7 @@ def test_objects_of_more_sweeps_are_taken(root, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_linear")
+@pytest.mark.usefixtures("linear")
 def test_a_refused_resume_leaves_the_objects_of_the_run(root, tmp_path, capsys):
     out = tmp_path / "run"
     command(*train(root, out, "--samples", "0:1", "--val-split", "none"))

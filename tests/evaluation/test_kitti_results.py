@@ -216,7 +216,7 @@ def test_damaged_files_are_named_before_anything_is_detected(root, tmp_path, mon
         ("--results found", "found: sample 000001: missing; sample 9: not expected: .* 2 samples of split 'val'$"),
         (
             "--results found/9.txt",
-            "--results: found/9.txt: found no folder, expected the folder of KITTI",
+            "--results: found/9.txt: expected --checkpoint too, .*, or a folder of KITTI's",
         ),
     ],
 )

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.config import Config, InferenceConfig, RefinementConfig, StemConfig
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Detector, build_detector
@@ -93,6 +94,11 @@ def untrained(config: Config, sensor: Sensor):
 
     shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
     return jax.tree_util.tree_map_with_path(fill, shapes)
+
+
+def save_untrained(folder: Path, config: Config = TINY_CONFIG, sensor: Sensor = TINY) -> None:
+    """Save a checkpoint with :func:`untrained` weights."""
+    save_checkpoint(folder, Checkpoint(config, sensor, untrained(config, sensor), 7))
 
 
 def train_tiny(folder: Path, *, save: int = 1, evaluate: int = 100, **options) -> TrainState:

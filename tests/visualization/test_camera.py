@@ -34,6 +34,10 @@ def drawn(monkeypatch):
     return figures
 
 
+def draw(image, found, truth=NOTHING):
+    draw_camera(image, image.with_name("x.png"), LOOK, classes=CLASSES, detections=found, truth=truth)
+
+
 def pixels_of_edges(box):
     """Positions in the image along all edges of a box, f64[n, 2], of points in front of the camera."""
     centre, size, yaw, found = np.array(box[:3]), np.array(box[3:6]), box[6], []
@@ -53,14 +57,7 @@ def pixels_of_edges(box):
     "box", [[12, 1, 0.2, 4, 2, 1.5, 0.4, 0, 0], [2, 0, -0.5, 6, 3, 0.4, 0.1, 0, 0]], ids=["in front", "beside"]
 )
 def test_lines_follow_the_edges(image, drawn, box):
-    draw_camera(
-        image,
-        "x.png",
-        LOOK,
-        classes=CLASSES,
-        detections=(np.array([box]), np.array([2]), np.array([0.5])),
-        truth=NOTHING,
-    )
+    draw(image, (np.array([box]), np.array([2]), np.array([0.5])))
     [axis] = drawn[0].axes
     lines = [line.get_xydata() for line in axis.get_lines()]
     expected = pixels_of_edges(box)
@@ -82,7 +79,7 @@ def _distance(place, start, end):
 def test_colours_labels_and_boxes_behind_the_camera(image, drawn):
     boxes = np.array([[12, 1, 0, 4, 2, 1.5, 0, 0, 0], [-12, 1, 0, 4, 2, 1.5, 0, 0, 0]])
     found = boxes, np.array([0, 1]), np.array([0.75, 0.9])
-    draw_camera(image, "x.png", LOOK, classes=CLASSES, detections=found, truth=(boxes, np.array([3, 3])))
+    draw(image, found, truth=(boxes, np.array([3, 3])))
     [axis] = drawn[0].axes
     lines = axis.get_lines()
     assert [line.get_color() for line in lines] == [class_color(3)] * 12 + [class_color(0)] * 12
@@ -94,14 +91,7 @@ def test_colours_labels_and_boxes_behind_the_camera(image, drawn):
 def test_a_damaged_image_is_named(image, content):
     image.write_bytes(content)
     with refused(str(image), "expected a PNG or JPEG image"):
-        draw_camera(
-            image,
-            image.with_name("x.png"),
-            LOOK,
-            classes=CLASSES,
-            detections=(*NOTHING, np.zeros(0)),
-            truth=NOTHING,
-        )
+        draw(image, (*NOTHING, np.zeros(0)))
 
 
 @pytest.mark.slow

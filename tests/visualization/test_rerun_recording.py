@@ -1,12 +1,10 @@
 """Check recordings by reading them with rerun."""
 
-import sys
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
+from fcos_lidar_jax.visualization.rerun_recording import rerun_recording
 
 POINTS = np.array([[1, 2, 3, 9], [4, 5, 6, 9], [np.nan, 0, 0, 0]], np.float32)
 BOXES = np.array([[8, 5, 0, 6, 3, 2, 0.4, 0, 0], [-10, -6, -1, 8, 3, 3, 2, 1, 0]], np.float32)
@@ -59,9 +57,3 @@ def test_boxes_of_low_score_are_left_out_and_truth_is_recorded(tmp_path):
     np.testing.assert_array_equal(columns["/sensor/boxes", "centers"][0], BOXES[:1, :3])
     assert columns["/sensor/truth", "labels"] == [["car, truth", "bus, truth"]]
     np.testing.assert_array_equal(columns["/sensor/truth", "centers"][0], BOXES[::-1, :3])
-
-
-def test_without_rerun_one_line_names_the_package_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ValueError, match=r"^--rrd: rerun is not installed.*pip install -e '\.\[viz\]' in"):
-        check_rerun()
