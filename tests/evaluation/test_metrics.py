@@ -7,6 +7,7 @@ import pytest
 from made_evaluation import make_task, truth_of
 from metrics_oracle import assert_numbers, score, turned, yaw
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.evaluation import evaluate_detections, metrics
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.boxes import ATTRIBUTE_INDEX, CLASS_ATTRIBUTES, heading_yaw, make_columns
@@ -33,7 +34,7 @@ def official_boxes():
     random.seed(42)
     numpy_draws = np.random.RandomState(42)
     truth, found = [], []
-    for label, name in enumerate(NUSCENES_METRIC.classes):
+    for label, name in enumerate(NUSCENES_CLASSES):
         for boxes, each, reach in ((truth, 3, 15), (found, 25, 10)):
             for sample in np.repeat(np.arange(30), each):
                 boxes.append(official_box(numpy_draws, sample, label, sorted(CLASS_ATTRIBUTES[name]), reach))
