@@ -26,7 +26,7 @@ from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import ABOUT, PRESETS
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training import Schedule, train
-from fcos_lidar_jax.training.plan import RUN_SPEC, check_run, recorded_config
+from fcos_lidar_jax.training.plan import RUN_SPEC, recorded_config
 from fcos_lidar_jax.training.run import run_folder
 
 _PRESETS: Any = (
@@ -106,9 +106,8 @@ def run(args: Train) -> None:
             if task.cuts_objects and is_main_process:  # the other processes open the result
                 # A run with other frames or options keeps its objects.
                 config = recorded_config(task.config, task.frames)
-                cut_from = {"config": config, "objects": task.frames.fingerprint()}
-                check_run(args.out, json.loads(json.dumps(cut_from)), resume=resume)
-                with run_folder(args.out, resume=resume):
+                cut_from = json.dumps({"config": config, "objects": task.frames.fingerprint()})
+                with run_folder(args.out, json.loads(cut_from), resume=resume):
                     _cut_objects(args, task)
         with agreed("cannot train"):
             objects = _objects(args, task)

@@ -219,29 +219,23 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
         )
 
 
-def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> None:
+def check_run(folder: str | Path, spec: dict[str, Any], *, resume: bool) -> None:
     """Check that a run can be started or resumed in a folder; names the first field in which another run differs.
 
-    ``spec`` has fields of ``run.json`` that a resumed run must have; None checks only whether there is a run.
+    ``spec`` has fields of ``run.json`` that a resumed run must have.
     """
     folder = local_path(folder)
-    file = folder / RUN_SPEC
-    if not file.is_file():
-        if resume:
-            raise ValueError(f"{file}: found nothing, expected the run to resume")
-        # A new run would remove them.
-        if results := [*Checkpoints(folder / CHECKPOINTS).paths(), *folder.glob(METRICS)]:
-            raise ValueError(f"{results[-1]}: found without {RUN_SPEC}, expected another folder")
-        return
+    file, checkpoints = folder / RUN_SPEC, Checkpoints(folder / CHECKPOINTS).paths()
     if not resume:
-        raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
-    recorded = read_json(file, dict[str, Any], what="the specification of a run")
-    if spec is None:
+        # A new run would remove checkpoints and metrics.
+        if checkpoints or file.exists() or (folder / METRICS).exists():
+            raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
         return
+    recorded = read_json(file, dict[str, Any], what="the specification of the run to resume")
     recorded = {name: value for name, value in recorded.items() if name in spec}
     for name, was, now in _differences(recorded, spec):
         # Runs of earlier versions lack the hash, and a run with checkpoints does not use its first weights again.
-        if name == "weights_hash" and (name not in recorded or Checkpoints(folder / CHECKPOINTS).paths()):
+        if name == "weights_hash" and (name not in recorded or checkpoints):
             continue
         raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
 

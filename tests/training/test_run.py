@@ -432,10 +432,10 @@ LOST = "checkpoints: found none, but metrics of 4 steps, and this schedule saves
 AGAIN = {"resume": True}
 REFUSED = {  # what is removed from the folder of a run and written to it, options, and the error
     "another run": ("", {}, {}, "holds a run, expected another folder or --resume, in Python resume=T"),
-    "no run": ("run.json metrics.jsonl checkpoints", {}, AGAIN, "run.json: found nothing, expected the run"),
-    "no folder": (".", {}, AGAIN, "run.json: found nothing, expected the run"),
+    "no folder": (".", {}, AGAIN, "run.json: no such file, expected the specification of the run to resume"),
     "no JSON": ("", {"run.json": "{"}, AGAIN, "run.json: not JSON"),
-    "results": ("run.json", {}, {}, r"metrics\.jsonl: found without run\.json, expected another"),
+    "metrics": ("run.json checkpoints", {}, {}, "holds a run, expected another folder"),
+    "checkpoints": ("run.json metrics.jsonl", {}, {}, "holds a run, expected another folder"),
     "no checkpoints": ("checkpoints", {}, AGAIN, f"{LOST} 1: expected the"),
     "no last checkpoint": ("checkpoints", {}, {"resume": True, "save": 9, "evaluate": 9}, f"{LOST} 4"),
 }
