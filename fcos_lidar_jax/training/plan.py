@@ -24,7 +24,6 @@ from fcos_lidar_jax.data.point_files import check_num_lags
 from fcos_lidar_jax.fields import Bounds, Checked, Count, check
 from fcos_lidar_jax.files import local_path, read_json
 from fcos_lidar_jax.inference.detector import TrainedDetector
-from fcos_lidar_jax.input_pipeline.batching import check_counts, spread_indices
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options
@@ -40,6 +39,7 @@ from fcos_lidar_jax.training.step import make_state
 NUM_SEEDS = 2**32  # JAX uses 32 bits of a seed, so larger seeds would repeat smaller ones
 _MIN_EVALUATE_EVERY = 100
 """An evaluation of a whole split can take longer than so few steps, which hardly change the scores."""
+_NUM_INSPECTED = 20  # frames that are read before a run starts
 RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 
 Hook = Callable[[int, Record], None]
@@ -144,7 +144,6 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     """Plan a run, and refuse one that cannot be trained."""
     config, frames = spec.config, spec.frames
     order = SampleOrder(frames, config, seed=spec.seed)
-    check_counts(frames)
     for read in filter(None, (frames, spec.tests)):
         read.check_files(range(len(read)))
     size, number = config.optimizer.batch_size, mesh.size
@@ -201,11 +200,16 @@ def recorded_config(config: Config, frames: FrameSet) -> dict[str, Any]:
 
 
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
-    read = {index: frames.frame(index) for index in spread_indices(len(frames), 5)}
+    """What a sample of the frames shows; refuses frames with boxes but without a single point in them."""
+    indices = sorted({round(index) for index in np.linspace(0, len(frames) - 1, _NUM_INSPECTED)})
+    read = {index: frames.frame(index) for index in indices}
     inside = np.concatenate([frame.num_points for frame in read.values()])
-    if (num_empty := int((inside == 0).sum())) > len(inside) / 2:
-        found = f"{num_empty} of {len(inside)} boxes of {len(read)} frames contain no point"
-        yield f"{found} and are not learned: are points and boxes in the same frame?"
+    num_empty, same = int((inside == 0).sum()), "are points and boxes in the same frame?"
+    found = f"{num_empty} of {len(inside)} boxes of {len(read)} frames contain no point"
+    if num_empty == len(inside) > 0:
+        raise ValueError(f"{found}, expected some with points: {same}")
+    if num_empty > len(inside) / 2:
+        yield f"{found} and are not learned: {same}"
     clouds = {index: frame.points for index, frame in read.items()}
     for index, points in clouds.items():
         check_num_lags(points[:, 4], frames.name(index), config.num_sweeps)
