@@ -166,11 +166,8 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
 
 def _check_pasting(spec: RunSpec, epoch_steps: int) -> None:
     config = spec.config
-    if config.fade_epochs * epoch_steps >= spec.steps:
-        raise ValueError(
-            f"fade_epochs: got {config.fade_epochs}, of {epoch_steps} steps each, expected less than the run's "
-            f"{spec.steps} steps: nothing would be pasted"
-        )
+    expected = f"less than the run, {spec.steps} steps, {epoch_steps} per epoch: nothing would be pasted"
+    check(config.fade_epochs * epoch_steps < spec.steps, "fade_epochs", config.fade_epochs, expected)
     if spec.objects is None:
         raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
     make_paste(spec.objects, config)

@@ -169,7 +169,7 @@ def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, 
 
 BAD = mistakes(r"""
 --keep 0 => keep: got 0
---version v9 => v9: no such folder
+--version v9 => version: got v9, expected one of
 --train-split other => split 'other': not found
 --val-split other => split 'other': not found
 --train-split= => split '': not found
