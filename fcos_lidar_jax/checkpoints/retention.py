@@ -68,8 +68,8 @@ class Checkpoints:
         """All checkpoints, oldest first, without verification."""
         return sorted(path for path in self.folder.glob("[0-9]*") if path.is_dir())
 
-    def newest(self, like: TrainState) -> tuple[Checkpoint, TrainState] | None:
-        """The newest intact checkpoint with its state; None if the folder has no checkpoints.
+    def newest(self, like: TrainState) -> TrainState | None:
+        """The state of the newest intact checkpoint; None if the folder has no checkpoints.
 
         Corrupt checkpoints are skipped with a warning on standard error; if all are corrupt, a CheckpointError
         says so. An intact checkpoint that cannot be read, for lack of memory for example, is an error and not
@@ -82,7 +82,7 @@ class Checkpoints:
             except CheckpointError as error:
                 print(f"warning: {error}: going back to the checkpoint before", file=sys.stderr)
             else:
-                return read_checkpoint(path), read_state(path, like)
+                return read_state(path, like)
         if paths:
             raise CheckpointError(f"{self.folder}: all {len(paths)} checkpoints are damaged, expected a whole one")
         return None

@@ -210,7 +210,7 @@ def _start(run: Run) -> TrainState:
     if spec.resume:
         like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
         if (newest := run.checkpoints.newest(like)) is not None:
-            return newest[1]
+            return newest
         # Only a run that was killed before its first checkpoint begins again; the metrics of others would be lost.
         # A recorded evaluation comes after a checkpoint.
         first = next(filter(spec.saves_at, range(1, spec.steps)), spec.steps)
