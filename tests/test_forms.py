@@ -22,13 +22,6 @@ def test_the_requested_form_is_computed(form):
     assert jnp.allclose(actual, FORMS[form](x))
 
 
-def test_exported_programs_use_the_form_of_their_platform():
-    program = jax.jit(lambda x: in_form(None, FORMS, x, cpu="sine", default="cosine"))
-    for platform, name in (("cpu", "sine"), ("cuda", "cosine"), ("tpu", "cosine")):
-        text = export.export(program, platforms=(platform,))(jnp.ones(3)).mlir_module()
-        assert [form for form in FORMS if f"stablehlo.{form}" in text] == [name]
-
-
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_search_matches_numpy(side):
     rng = np.random.default_rng(0)

@@ -13,7 +13,7 @@ from commands import contents, cut
 from refusal import refused
 from tiny_run import CONFIG, SENSOR, bits
 
-from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, load_state, storage
+from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, storage
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_of, find_checkpoint
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.training import detection_variables, make_optimizer, make_state
@@ -189,9 +189,3 @@ def test_a_run_stands_for_its_last_or_best_checkpoint(copy):
     assert find_checkpoint(copy.folder / "00000004") == copy.folder / "00000004"
     shutil.rmtree(copy.folder)
     assert [find_checkpoint(path) for path in (run, run / "best")] == [run, run / "best"]
-
-
-def test_runs_are_loaded_like_checkpoints(copy):
-    run = copy.folder.parent
-    assert load_checkpoint(run / "best").step == 2
-    assert int(load_state(run, state_at(0)).step) == 6
