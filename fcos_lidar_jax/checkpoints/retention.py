@@ -34,7 +34,7 @@ class Checkpoints:
     def __init__(self, folder: Path, *, keep: int = 2) -> None:
         self.folder, self.keep = folder, keep
 
-    def save(self, checkpoint: Checkpoint, state: TrainState) -> Path:
+    def save(self, checkpoint: Checkpoint, state: TrainState) -> None:
         """Write a checkpoint, then remove old ones; if writing fails, the other checkpoints are unchanged."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{checkpoint.step:08d}"
@@ -44,7 +44,6 @@ class Checkpoints:
         for leftover in self.folder.glob(".*"):  # from saves that were killed
             shutil.rmtree(leftover, ignore_errors=True)
         self._prune(path)
-        return path
 
     def record_score(self, step: int, score: float) -> None:
         """Record the score of the checkpoint of a step, then remove old checkpoints."""

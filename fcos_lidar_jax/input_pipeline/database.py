@@ -149,7 +149,7 @@ def prepare_database(
     min_points: int = 5,
     num_sweeps: int = MAX_SWEEPS,
     workers: int = 1,
-    report: Callable[[int, int], None] | None = None,
+    report: Callable[[int, int], object] = lambda done, total: None,
 ) -> GroundTruthDatabase:
     """Cut the points of every box with at least ``min_points`` points over all sweeps, one shard per scene.
 
@@ -188,7 +188,6 @@ def prepare_database(
             jobs.append(job)
     if jobs:  # an old manifest would not fit the new shards
         (folder / _MANIFEST).unlink(missing_ok=True)
-    report = report or (lambda done, total: None)
     report(done, len(frames))
     for count in run_jobs(_cut_shard, frames, jobs, workers):
         done += count

@@ -293,12 +293,9 @@ def _with_second_look(
     fits = {n for n, leaf in own.items() if n in found and (found[n].shape == leaf.shape or not same)}
     if fits == own.keys() == found.keys():
         return variables
-    if found:
-        left_out = len(found.keys() - own.keys())
-        changes = f"{len(own) - len(fits)} of {len(own)} arrays start with random weights, {left_out} are left out"
-        tell(f"{where}: has another second look: {changes}")
-    else:
-        tell(f"{where}: has no second look: it starts with random weights")
+    anew, left_out = len(own) - len(fits), len(found.keys() - own.keys())
+    changes = f"{anew} of {len(own)} arrays start with random weights, {left_out} are left out"
+    tell(f"{where}: has another second look, or none: {changes}")
     leaves = [found[name] if name in fits else leaf for name, leaf in own.items()]
     look = jax.tree.unflatten(jax.tree.structure(new), leaves)
     return variables | {"params": params | {SECOND_LOOK: look}}
