@@ -229,7 +229,7 @@ def test_a_frame_without_boxes_and_points_gives_an_empty_sample():
 def test_batches_of_workers_are_the_same_and_signals_are_left_to_the_main_process(alone, objects):
     options = {"seed": 0, "num_steps": STEPS, "threads": 2, "objects": objects, "workers": 2}
     with make_batches(ToyFrames(), CONFIG, **options) as stream:
-        found = [next(stream)]
+        found = [next(stream), next(stream)]  # one of each worker, which has then begun
         for process in multiprocessing.active_children():
             os.kill(process.pid, signal.SIGTERM)
             os.kill(process.pid, signal.SIGINT)
