@@ -1,4 +1,4 @@
-"""``in_form`` computes the requested form, or the form that suits the platform."""
+"""Functions in several forms take the one that suits the platform; their own tests ask for each form."""
 
 import functools
 
@@ -9,17 +9,8 @@ import pytest
 from jax import export
 
 from fcos_lidar_jax.assignment import assign, owners
-from fcos_lidar_jax.forms import in_form, search
+from fcos_lidar_jax.forms import search
 from fcos_lidar_jax.nms import merge_boxes
-
-FORMS = {"sine": jnp.sin, "cosine": jnp.cos}
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_the_requested_form_is_computed(form):
-    x = jnp.linspace(0, 1, 5)
-    actual = jax.jit(lambda x: in_form(form, FORMS, x, default="sine"))(x)
-    assert jnp.allclose(actual, FORMS[form](x))
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

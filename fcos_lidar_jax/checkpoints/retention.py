@@ -4,6 +4,7 @@ Orbax's ``CheckpointManager`` is not used: it restores corrupt arrays without an
 older checkpoint, and lets two processes write into one folder (tried with Orbax 0.12).
 """
 
+import contextlib
 import shutil
 import sys
 import tempfile
@@ -91,12 +92,9 @@ def best_of(paths: list[Path]) -> Path | None:
     """The checkpoint with the highest score, the newest of equal ones; None if no checkpoint has a score."""
     scored = []
     for path in paths:
-        try:
-            score = read_description(path).get("score")
-        except CheckpointError:
-            continue
-        if score is not None:
-            scored.append((score, path))
+        with contextlib.suppress(CheckpointError):
+            if (score := read_description(path).get("score")) is not None:
+                scored.append((score, path))
     return max(scored)[1] if scored else None
 
 
