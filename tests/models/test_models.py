@@ -20,7 +20,7 @@ from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.layers import BatchNorm, GroupNorm
 from fcos_lidar_jax.models.lidar_net import Backbone
 from fcos_lidar_jax.models.modality import Stem, channel_groups
-from fcos_lidar_jax.presets import COMPACT, NUSCENES, NUSCENES_TEST, QUICKSTART
+from fcos_lidar_jax.presets import COMPACT, NUSCENES, NUSCENES_TEST, PRESETS, QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.types import CHANNELS
@@ -35,6 +35,19 @@ def with_model(config, **changes):
 
 
 SMALL_STEM = StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2))
+
+
+def test_all_parts_have_the_same_channels():
+    number, rounds = len(CHANNELS), 5
+    image = project_points(np.zeros((1, 5)), np.zeros(1, bool), TINY, num_rounds=1)
+    assert image.features.shape[2] == number
+    for groups in ("types", "modalities", "all"):
+        assert sum(inputs for inputs, _ in channel_groups(StemConfig(groups=groups), rounds)) == number * rounds
+    assert channel_groups(StemConfig(group_rounds=False, channels_per_type=5), rounds) == [(1, 1)] * (
+        number * rounds
+    )
+    for preset in PRESETS.values():
+        assert 9 <= len(preset.model.channel_mean) == len(preset.model.channel_scale) <= number
 
 
 TEN = {
@@ -130,7 +143,6 @@ def stem_of_groups(params, image, config):
         {"num_convs": 2, "dilations": (2,)},
         {"num_convs": 1, "group_rounds": False, "dilations": (1,)},
         {"num_convs": 2, "groups": "modalities"},
-        {"num_convs": 1, "groups": "all", "dilations": (1,)},
     ],
 )
 def test_the_stem_convolves_each_group_separately(choices):

@@ -279,6 +279,16 @@ def test_each_loss_is_divided_by_the_number_of_its_locations(axes, accumulate):
     np.testing.assert_allclose(gradient["regression"], expected["regression"] / candidates, rtol=1e-3, atol=1e-8)
 
 
+def test_every_weight_of_the_configuration_has_a_loss(trainer):
+    detector, state, _, _ = trainer
+    step = make_train_step(detector, make_optimizer(CONFIG.optimizer, STEPS))
+    _, metrics = jax.eval_shape(step, state, empty_batch(1))
+    found = {f"{name.removeprefix('loss/')}_weight" for name in metrics if name.startswith("loss/")}
+    named = {field.name for field in dataclasses.fields(CONFIG.loss) if field.name.endswith("_weight")}
+    # The velocity's is a weight within the L1 loss; the others belong to the second look.
+    assert found - {"total_weight"} == named - {"velocity_weight", "refined_class_weight", "refined_box_weight"}
+
+
 def test_a_new_loss_is_divided_by_the_locations_of_the_regression(monkeypatch):
     def with_height(*sample, **options):
         parts, *rest = sample_losses(*sample, **options)
