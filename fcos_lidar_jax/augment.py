@@ -31,11 +31,8 @@ def check_augmentation(config: AugmentConfig, sensor: Sensor) -> None:
     right, left = sensor.azimuth_limits_rad
     where = f"sensor {sensor.name!r} covers {np.degrees(left - right):.0f} degrees"
     half = (left - right) / 2
-    if config.max_rotation_rad > half:
-        raise ValueError(
-            f"augment.max_rotation_rad: got {config.max_rotation_rad:.3g}, expected at most {half:.3g}, half of "
-            f"the sector: {where}"
-        )
+    angle, expected = config.max_rotation_rad, f"at most {half:.3g}, half of the sector: {where}"
+    check(angle <= half, "augment.max_rotation_rad", angle, expected)
     # A flip of x maps azimuth a to pi - a, a flip of y maps it to -a.
     for name, turn in (("flip_x_probability", np.pi), ("flip_y_probability", 0.0)):
         offset = (right + left - turn + np.pi) % (2 * np.pi) - np.pi

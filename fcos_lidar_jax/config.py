@@ -351,10 +351,8 @@ def config_to_json(config: Config) -> dict[str, Any]:
     True
     """
     record = dataclasses.asdict(config)
-    if (kind := _kind_of(record)) is not type(config):
-        raise ValueError(
-            f"config: got fields of {kind.__name__}, expected one that only {type(config).__name__} has"
-        )
+    kind, own = _kind_of(record), type(config)
+    check(kind is own, "config", kind.__name__, f"a field that only {own.__name__} has")
     return record
 
 

@@ -38,7 +38,7 @@ class Sensor(Checked):
     origin_m: Annotated[tuple[float, float, float], _Place] = (0.0, 0.0, 0.0)
     """In the points' frame; subtracted before equation 1."""
     limit_xy_m: _Positive = 54.0  # Points with ``|x|`` or ``|y|`` at or beyond this limit are dropped.
-    limit_z_m: Annotated[tuple[float, float], _Place] = (-5.0, 3.0)
+    limit_z_m: Annotated[tuple[float, float], Bounds(-_MAX_NUMBER, _MAX_NUMBER, ascending=True)] = (-5.0, 3.0)
     """Points with z outside this open interval are dropped."""
     intensity_scale: _Positive = 1.0  # Factor from the intensity in files to the scale 0-255.
     row_source: Literal["inclination", "laser"] = "inclination"
@@ -58,7 +58,6 @@ class Sensor(Checked):
         decreasing = 2 <= len(table) <= _MAX_ROWS and all(above > below for above, below in pairwise(table))
         expected = f"2 to {_MAX_ROWS} strictly decreasing values, the highest beam first"
         check(decreasing, "inclinations_rad", table, expected)
-        check(self.limit_z_m[0] < self.limit_z_m[1], "limit_z_m", self.limit_z_m, "(low, high) with low < high")
         if ends is not None:
             within = abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
             expected = "(right, left) with right in [-pi, pi] and left at most one turn further"

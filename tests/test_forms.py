@@ -1,4 +1,4 @@
-"""``in_form`` computes the requested form, or the form that suits the platform."""
+"""Functions in several forms take the one that suits the platform; their own tests ask for each form."""
 
 import functools
 
@@ -9,24 +9,8 @@ import pytest
 from jax import export
 
 from fcos_lidar_jax.assignment import assign, owners
-from fcos_lidar_jax.forms import in_form, search
+from fcos_lidar_jax.forms import search
 from fcos_lidar_jax.nms import merge_boxes
-
-FORMS = {"sine": jnp.sin, "cosine": jnp.cos}
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_the_requested_form_is_computed(form):
-    x = jnp.linspace(0, 1, 5)
-    actual = jax.jit(lambda x: in_form(form, FORMS, x, default="sine"))(x)
-    assert jnp.allclose(actual, FORMS[form](x))
-
-
-def test_exported_programs_use_the_form_of_their_platform():
-    program = jax.jit(lambda x: in_form(None, FORMS, x, cpu="sine", default="cosine"))
-    for platform, name in (("cpu", "sine"), ("cuda", "cosine"), ("tpu", "cosine")):
-        text = export.export(program, platforms=(platform,))(jnp.ones(3)).mlir_module()
-        assert [form for form in FORMS if f"stablehlo.{form}" in text] == [name]
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -56,11 +56,8 @@ def test_wrapped_angles_lie_in_the_half_open_interval_and_keep_their_direction(d
 
 
 def test_the_boundary_of_a_box_is_inside():
-    box, centre, half = (
-        jnp.array([1, 2, 3, 4, 2, 1, 0], jnp.float32),
-        np.float32([1, 2, 3]),
-        np.float32([2, 1, 0.5]),
-    )
+    box = jnp.array([1, 2, 3, 4, 2, 1, 0], jnp.float32)
+    centre, half = np.float32([1, 2, 3]), np.float32([2, 1, 0.5])
     ends = np.concatenate([np.diag(half), -np.diag(half)])
     assert points_in_box(jnp.asarray(centre + ends), box).all()
     assert not points_in_box(jnp.asarray(centre + ends + 1e-5 * np.sign(ends)), box).any()

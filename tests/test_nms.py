@@ -113,22 +113,10 @@ def test_without_valid_boxes_and_with_boxes_of_zero_size(form):
 
 
 def test_exported_programs_use_the_form_of_their_platform():
-    boxes, scores, valid, _ = clusters(0, 70)
     suppress = jax.jit(lambda *args: rotated_nms(*args, **OPTIONS))
-    programs = {
-        platforms: export.export(suppress, platforms=platforms)(boxes, scores, valid)
-        for platforms in (("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda"))
-    }
-    texts = {platforms: program.mlir_module() for platforms, program in programs.items()}
-    # Rows have a loop in a loop, the matrix has one, and NVIDIA's plugin adds one. The matrix of overlaps
-    # identifies the matrix form.
-    loops = {platforms: text.count("stablehlo.while") for platforms, text in texts.items()}
-    matrices = [platforms for platforms, text in texts.items() if "tensor<70x70xi1>" in text]
-    cuda = 2 if jax.default_backend() == "gpu" else 1
-    assert loops == {("cpu",): 2, ("cuda",): cuda, ("tpu",): 1, ("cpu", "cuda"): 2 + cuda}
-    assert matrices == [("cuda",), ("tpu",), ("cpu", "cuda")]
-    expected = oracles.nms(boxes, scores, valid, np.zeros(70), 0.2, 100)
-    assert indices(*programs["cpu", "cuda"].call(boxes, scores, valid)) == expected
+    for platform, is_matrix in (("cpu", False), ("cuda", True), ("tpu", True)):
+        text = export.export(suppress, platforms=(platform,))(*clusters(0, 70)[:3]).mlir_module()
+        assert ("tensor<70x70xi1>" in text) == is_matrix
 
 
 def merged_by_loops(boxes, scores, valid, labels, kept, threshold, *, vertical):

@@ -43,8 +43,3 @@ class CenterPointConfig(Config):
         from fcos_lidar_jax.centerpoint.detector import build  # Reading a configuration must not import JAX.
 
         return build(self, self.pillars, sensor)
-
-    @property
-    def class_groups(self) -> tuple[int, ...]:
-        """Group of each class."""
-        return self.pillars.class_groups(len(self.classes))

@@ -32,9 +32,8 @@ class PillarConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self.pillar_m < self.range_m, "pillar_m", self.pillar_m, f"between 0 and {self.range_m} m")
         side = 2 * self.range_m / self.pillar_m
-        whole = abs(side - round(side)) < 1e-3 and round(side) % 8 == 0
+        whole = abs(side - round(side)) < 1e-3 and round(side) % 8 == 0 < round(side)
         check(whole, "pillar_m", self.pillar_m, f"{2 * self.range_m:g} m divided by a multiple of 8")
         consecutive = set(self.groups) == set(range(max(self.groups, default=-1) + 1))
         check(consecutive, "groups", self.groups, "the numbers from 0 up to the last group")

@@ -4,6 +4,7 @@ Orbax's ``CheckpointManager`` is not used: it restores corrupt arrays without an
 older checkpoint, and lets two processes write into one folder (tried with Orbax 0.12).
 """
 
+import contextlib
 import shutil
 import sys
 import tempfile
@@ -34,7 +35,7 @@ class Checkpoints:
     def __init__(self, folder: Path, *, keep: int = 2) -> None:
         self.folder, self.keep = folder, keep
 
-    def save(self, checkpoint: Checkpoint, state: TrainState) -> Path:
+    def save(self, checkpoint: Checkpoint, state: TrainState) -> None:
         """Write a checkpoint, then remove old ones; if writing fails, the other checkpoints are unchanged."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{checkpoint.step:08d}"
@@ -44,7 +45,6 @@ class Checkpoints:
         for leftover in self.folder.glob(".*"):  # from saves that were killed
             shutil.rmtree(leftover, ignore_errors=True)
         self._prune(path)
-        return path
 
     def record_score(self, step: int, score: float) -> None:
         """Record the score of the checkpoint of a step, then remove old checkpoints."""
@@ -68,8 +68,8 @@ class Checkpoints:
         """All checkpoints, oldest first, without verification."""
         return sorted(path for path in self.folder.glob("[0-9]*") if path.is_dir())
 
-    def newest(self, like: TrainState) -> tuple[Checkpoint, TrainState] | None:
-        """The newest intact checkpoint with its state; None if the folder has no checkpoints.
+    def newest(self, like: TrainState) -> TrainState | None:
+        """The state of the newest intact checkpoint; None if the folder has no checkpoints.
 
         Corrupt checkpoints are skipped with a warning on standard error; if all are corrupt, a CheckpointError
         says so. An intact checkpoint that cannot be read, for lack of memory for example, is an error and not
@@ -82,7 +82,7 @@ class Checkpoints:
             except CheckpointError as error:
                 print(f"warning: {error}: going back to the checkpoint before", file=sys.stderr)
             else:
-                return read_checkpoint(path), read_state(path, like)
+                return read_state(path, like)
         if paths:
             raise CheckpointError(f"{self.folder}: all {len(paths)} checkpoints are damaged, expected a whole one")
         return None
@@ -92,12 +92,9 @@ def best_of(paths: list[Path]) -> Path | None:
     """The checkpoint with the highest score, the newest of equal ones; None if no checkpoint has a score."""
     scored = []
     for path in paths:
-        try:
-            score = read_description(path).get("score")
-        except CheckpointError:
-            continue
-        if score is not None:
-            scored.append((score, path))
+        with contextlib.suppress(CheckpointError):
+            if (score := read_description(path).get("score")) is not None:
+                scored.append((score, path))
     return max(scored)[1] if scored else None
 
 

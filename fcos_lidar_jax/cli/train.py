@@ -105,9 +105,8 @@ def run(args: Train) -> None:
             if task.cuts_objects and is_main_process:  # the other processes open the result
                 # A run with other frames or options keeps its objects.
                 config = recorded_config(task.config, task.frames)
-                cut_from = {"config": config, "objects": task.frames.fingerprint()}
-                spec = json.loads(json.dumps(cut_from)) if resume else None
-                with run_folder(args.out, spec, resume=resume):
+                cut_from = json.dumps({"config": config, "objects": task.frames.fingerprint()})
+                with run_folder(args.out, json.loads(cut_from), resume=resume):
                     _cut_objects(task)
         with agreed("cannot train"):
             objects = _objects(task, args.data)

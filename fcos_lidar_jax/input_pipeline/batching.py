@@ -7,12 +7,10 @@ import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import check_boxes
 from fcos_lidar_jax.data.cloud_policy import usable_rows, write_points
-from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.point_files import check_time_lags
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.types import Batch
-
-_NUM_INSPECTED = 20  # frames in which check_counts looks for points
 
 
 def empty_batch(size: int, *, max_points: int, max_boxes: int, columns: int) -> Batch:
@@ -86,7 +84,7 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     """
     columns = frames[0].points.shape[-1]
     for row, frame in enumerate(frames):
-        _check_frame(f"frame {row}", frame, columns)
+        _check_frame(f"frame {row}", frame)
     batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
     for row, frame in enumerate(frames):
         for name, rows, limit in (("points", frame.points, max_points), ("boxes", frame.boxes, max_boxes)):
@@ -95,43 +93,13 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     return batch
 
 
-def _check_frame(where: str, frame: Frame, columns: int) -> None:
+def _check_frame(where: str, frame: Frame) -> None:
     """Refuse a frame whose arrays do not fit each other, or with an implausible box or label."""
     number = len(frame.boxes)
     for name, shape in (("boxes", (number, 9)), ("labels", (number,)), ("num_points", (number,))):
         found = getattr(frame, name).shape
         check(found == shape, f"{where}: {name}: shape", found, f"{shape}")
-    fits = frame.points.ndim == 2 and columns in (5, 6) and frame.points.shape[1] == columns
-    expected = "[n, 5], or [n, 6] with laser numbers, as the other frames"
-    check(fits, f"{where}: points: shape", frame.points.shape, expected)
     check_time_lags(frame.points[:, 4], f"{where}: points")
     check_boxes(frame.boxes, lambda box: f"{where}: box {box}")
     least = int(frame.labels.min(initial=0))
     check(least >= 0, f"{where}: labels", least, "indices of classes, from 0")
-
-
-def spread_indices(size: int, number: int) -> list[int]:
-    """At most ``number`` indices, spread evenly over a sequence of a given size.
-
-    >>> spread_indices(9, 3), spread_indices(2, 3), spread_indices(0, 3)
-    ([0, 4, 8], [0, 1], [])
-    """
-    return sorted({round(i) for i in np.linspace(0, size - 1, number).tolist()}) if size else []
-
-
-def check_counts(frames: FrameSet) -> None:
-    """Refuse frames with boxes but without a single point in them: training would see no object.
-
-    Reads a sample of the frames, until one has a box with a point.
-    """
-    empty = None
-    for index in spread_indices(len(frames), _NUM_INSPECTED):
-        frame = frames.frame(index)
-        if (frame.num_points >= 1).any():
-            return
-        empty = frames.name(index) if empty is None and len(frame.boxes) else empty
-    if empty is not None:
-        raise ValueError(
-            f"frame {empty!r}: box 0: got 0 points, like all boxes of {min(_NUM_INSPECTED, len(frames))} frames, "
-            "expected some with points: are points and boxes in the same frame?"
-        )

@@ -143,11 +143,11 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
         _refuse(data, version=version)
         return data
     versions = sorted(file.parent.name for file in data.root.glob("*/sample.json"))
-    if not version and len(versions) != 1:
-        raise ValueError(f"{root}: got versions {', '.join(versions) or '(none)'}, expected one: name it")
-    version = version or versions[0]
-    if not (data.root / version).is_dir():
-        raise ValueError(f"{data.root / version}: no such folder, expected one of {', '.join(versions) or 'none'}")
+    if not version and len(versions) == 1:
+        version = versions[0]
+    if not version or not (data.root / version).is_dir():
+        known = ", ".join(versions) or "(none)"
+        raise ValueError(f"{data.root}: version: got {version or 'none'}, expected one of {known}")
     return dataclasses.replace(data, version=version)
 
 

@@ -33,9 +33,9 @@ class MetricsLog:
         self._folder.mkdir(exist_ok=True)
         with naming(self._folder):
             self._events = RecordWriter(str(self._folder / f"events.out.tfevents.{time.time_ns()}"))
-            self._write_event(first_step + 1, file_version="brain.Event:2")
-            # TensorBoard then drops earlier events of these steps.
-            self._write_event(first_step + 1, session_log={"status": _START})
+        self._write_event(first_step + 1, file_version="brain.Event:2")
+        # TensorBoard then drops earlier events of these steps.
+        self._write_event(first_step + 1, session_log={"status": _START})
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         with naming(Path(self._lines.name)):
@@ -50,8 +50,7 @@ class MetricsLog:
             for tag, value in scalars.items()
             if np.isscalar(value)
         ]
-        with naming(self._folder):
-            self._write_event(step, summary={"value": numbers})
+        self._write_event(step, summary={"value": numbers})
 
     def write_pictures(self, step: int, pictures: Iterable[Path]) -> None:
         """Show PNG files in TensorBoard, by the number of the frame with which their names end."""
@@ -63,8 +62,7 @@ class MetricsLog:
                 size = {"width": picture.width, "height": picture.height, "colorspace": len(picture.getbands())}
             tag = f"test/frame_{path.stem.rpartition('_')[2]}"
             images.append({"tag": tag, "image": {**size, "encoded_image_string": path.read_bytes()}})
-        with naming(self._folder):
-            self._write_event(step, summary={"value": images})
+        self._write_event(step, summary={"value": images})
 
     def flush(self) -> None:
         """Write buffered events, so that no checkpoint has more steps than the records."""
@@ -78,7 +76,9 @@ class MetricsLog:
     def _write_event(self, step: int, **content: Any) -> None:
         from tensorboardX.proto.event_pb2 import Event  # TensorBoard's message # type: ignore[attr-defined]
 
-        self._events.write(Event(step=step, wall_time=time.time(), **content).SerializeToString())
+        event = Event(step=step, wall_time=time.time(), **content)
+        with naming(self._folder):
+            self._events.write(event.SerializeToString())
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:

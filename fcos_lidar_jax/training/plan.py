@@ -24,7 +24,6 @@ from fcos_lidar_jax.data.point_files import check_num_lags
 from fcos_lidar_jax.fields import Bounds, Checked, Count, check
 from fcos_lidar_jax.files import local_path, read_json
 from fcos_lidar_jax.inference.detector import TrainedDetector
-from fcos_lidar_jax.input_pipeline.batching import check_counts, spread_indices
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options
@@ -40,6 +39,7 @@ from fcos_lidar_jax.training.step import make_state
 NUM_SEEDS = 2**32  # JAX uses 32 bits of a seed, so larger seeds would repeat smaller ones
 _MIN_EVALUATE_EVERY = 100
 """An evaluation of a whole split can take longer than so few steps, which hardly change the scores."""
+_NUM_INSPECTED = 10  # frames that are read before a run starts
 RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 
 Hook = Callable[[int, Record], None]
@@ -144,7 +144,6 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     """Plan a run, and refuse one that cannot be trained."""
     config, frames = spec.config, spec.frames
     order = SampleOrder(frames, config, seed=spec.seed)
-    check_counts(frames)
     for read in filter(None, (frames, spec.tests)):
         read.check_files(range(len(read)))
     size, number = config.optimizer.batch_size, mesh.size
@@ -167,11 +166,8 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
 
 def _check_pasting(spec: RunSpec, epoch_steps: int) -> None:
     config = spec.config
-    if config.fade_epochs * epoch_steps >= spec.steps:
-        raise ValueError(
-            f"fade_epochs: got {config.fade_epochs}, of {epoch_steps} steps each, expected less than the run's "
-            f"{spec.steps} steps: nothing would be pasted"
-        )
+    expected = f"less than the run, {spec.steps} steps, {epoch_steps} per epoch: nothing would be pasted"
+    check(config.fade_epochs * epoch_steps < spec.steps, "fade_epochs", config.fade_epochs, expected)
     if spec.objects is None:
         raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
     make_paste(spec.objects, config)
@@ -201,11 +197,16 @@ def recorded_config(config: Config, frames: FrameSet) -> dict[str, Any]:
 
 
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
-    read = {index: frames.frame(index) for index in spread_indices(len(frames), 5)}
+    """What a sample of the frames shows; refuses frames with boxes but without a single point in them."""
+    indices = sorted({round(index) for index in np.linspace(0, len(frames) - 1, _NUM_INSPECTED)})
+    read = {index: frames.frame(index) for index in indices}
     inside = np.concatenate([frame.num_points for frame in read.values()])
-    if (num_empty := int((inside == 0).sum())) > len(inside) / 2:
-        found = f"{num_empty} of {len(inside)} boxes of {len(read)} frames contain no point"
-        yield f"{found} and are not learned: are points and boxes in the same frame?"
+    num_empty, same = int((inside == 0).sum()), "are points and boxes in the same frame?"
+    found = f"{num_empty} of {len(inside)} boxes of {len(read)} frames contain no point"
+    if num_empty == len(inside) > 0:
+        raise ValueError(f"{found}, expected some with points: {same}")
+    if num_empty > len(inside) / 2:
+        yield f"{found} and are not learned: {same}"
     clouds = {index: frame.points for index, frame in read.items()}
     for index, points in clouds.items():
         check_num_lags(points[:, 4], frames.name(index), config.num_sweeps)
@@ -219,29 +220,23 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
         )
 
 
-def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> None:
+def check_run(folder: str | Path, spec: dict[str, Any], *, resume: bool) -> None:
     """Check that a run can be started or resumed in a folder; names the first field in which another run differs.
 
-    ``spec`` has fields of ``run.json`` that a resumed run must have; None checks only whether there is a run.
+    ``spec`` has fields of ``run.json`` that a resumed run must have.
     """
     folder = local_path(folder)
-    file = folder / RUN_SPEC
-    if not file.is_file():
-        if resume:
-            raise ValueError(f"{file}: found nothing, expected the run to resume")
-        # A new run would remove them.
-        if results := [*Checkpoints(folder / CHECKPOINTS).paths(), *folder.glob(METRICS)]:
-            raise ValueError(f"{results[-1]}: found without {RUN_SPEC}, expected another folder")
-        return
+    file, checkpoints = folder / RUN_SPEC, Checkpoints(folder / CHECKPOINTS).paths()
     if not resume:
-        raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
-    recorded = read_json(file, dict[str, Any], what="the specification of a run")
-    if spec is None:
+        # A new run would remove checkpoints and metrics.
+        if checkpoints or file.exists() or (folder / METRICS).exists():
+            raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
         return
+    recorded = read_json(file, dict[str, Any], what="the specification of the run to resume")
     recorded = {name: value for name, value in recorded.items() if name in spec}
     for name, was, now in _differences(recorded, spec):
         # Runs of earlier versions lack the hash, and a run with checkpoints does not use its first weights again.
-        if name == "weights_hash" and (name not in recorded or Checkpoints(folder / CHECKPOINTS).paths()):
+        if name == "weights_hash" and (name not in recorded or checkpoints):
             continue
         raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
 
@@ -298,12 +293,9 @@ def _with_second_look(
     fits = {n for n, leaf in own.items() if n in found and (found[n].shape == leaf.shape or not same)}
     if fits == own.keys() == found.keys():
         return variables
-    if found:
-        left_out = len(found.keys() - own.keys())
-        changes = f"{len(own) - len(fits)} of {len(own)} arrays start with random weights, {left_out} are left out"
-        tell(f"{where}: has another second look: {changes}")
-    else:
-        tell(f"{where}: has no second look: it starts with random weights")
+    anew, left_out = len(own) - len(fits), len(found.keys() - own.keys())
+    changes = f"{anew} of {len(own)} arrays start with random weights, {left_out} are left out"
+    tell(f"{where}: has another second look, or none: {changes}")
     leaves = [found[name] if name in fits else leaf for name, leaf in own.items()]
     look = jax.tree.unflatten(jax.tree.structure(new), leaves)
     return variables | {"params": params | {SECOND_LOOK: look}}

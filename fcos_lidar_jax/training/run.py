@@ -66,6 +66,8 @@ def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> 
         with agreed("cannot train"):
             if is_main_process:
                 held.enter_context(run_folder(spec.out, run.record, resume=spec.resume))
+                if not spec.resume:
+                    atomic_write(spec.out / RUN_SPEC, json.dumps(run.record, indent=1))
         with agreed("cannot train"):
             start = _start(run)
             first = int(start.step)
@@ -191,16 +193,14 @@ def _call(hooks: Sequence[Hook], number: int, values: Record) -> None:
 
 
 @contextlib.contextmanager
-def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool) -> Iterator[None]:
-    """Lock the folder of a run against other processes; with ``spec``, make it the folder of that run.
+def run_folder(folder: Path, spec: dict[str, Any], *, resume: bool) -> Iterator[None]:
+    """Lock the folder of a run, of which ``spec`` has fields of ``run.json``, against other processes.
 
     Errors of :func:`~fcos_lidar_jax.training.plan.check_run` are raised before anything is written.
     """
     check_run(folder, spec, resume=resume)  # before the lock, which makes the folder
     with folder_lock(folder, "training"):
         check_run(folder, spec, resume=resume)  # another process may have been faster
-        if spec is not None and not resume:
-            atomic_write(folder / RUN_SPEC, json.dumps(spec, indent=1))
         yield
 
 
@@ -210,7 +210,7 @@ def _start(run: Run) -> TrainState:
     if spec.resume:
         like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
         if (newest := run.checkpoints.newest(like)) is not None:
-            return newest[1]
+            return newest
         # Only a run that was killed before its first checkpoint begins again; the metrics of others would be lost.
         # A recorded evaluation comes after a checkpoint.
         first = next(filter(spec.saves_at, range(1, spec.steps)), spec.steps)

@@ -54,16 +54,12 @@ def test_candidates_are_the_best_pairs_of_cell_and_class_also_under_vmap(outputs
 
 
 @pytest.mark.slow
-def test_points_to_boxes_in_any_order_and_of_nothing():
+def test_points_to_boxes_and_of_nothing():
     detector = build_detector(dataclasses.replace(CONFIG, max_points=4096), SENSOR)
     variables, detect = jax.jit(detector.init)(jax.random.key(0)), jax.jit(make_detect(detector))
     points = make_frame(0, SENSOR).points
-    order = np.random.default_rng(0).permutation(len(points))
-    found, shuffled = (detect(variables, p, np.ones(len(p), bool)) for p in (points, points[order]))
-    assert found.valid.any()
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(shuffled), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-4)
     every = np.ones(len(points), bool)
+    assert detect(variables, points, every).valid.any()
     for nothing in (detect(variables, points, ~every), detect(variables, points * np.nan, every)):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nothing))
         assert not nothing.valid.any()

@@ -33,7 +33,7 @@ def losses_of(config):
 
 
 def outputs(config, seed=0):
-    rng, groups = np.random.default_rng(seed), max(config.class_groups) + 1
+    rng, groups = np.random.default_rng(seed), max(config.pillars.class_groups(10)) + 1
     heat = rng.normal(-2, 1, (GRID.side, GRID.side, 10)).astype(np.float32)
     regression = rng.normal(0, 0.3, (GRID.side, GRID.side, groups, 10)).astype(np.float32)
     return CentreOutputs(*map(jnp.asarray, (heat, regression)))
@@ -53,7 +53,7 @@ def test_sums_equal_a_loop_over_boxes(config):
     targets = targets_of(boxes, labels, valid)
     away, at = focal_loss(predicted.heat, targets.heat, targets.cell, labels, targets.valid)
     numbers = np.asarray(encode_centres(targets.boxes, targets.cell, GRID))
-    groups = config.class_groups
+    groups = config.pillars.class_groups(10)
     heat, l1, count = (np.zeros(max(groups) + 1) for _ in range(3))
     for k in range(10):
         heat[groups[k]] += away[k]

@@ -13,7 +13,7 @@ from commands import contents, cut
 from refusal import refused
 from tiny_run import CONFIG, SENSOR, bits
 
-from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, load_state, storage
+from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, storage
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_of, find_checkpoint
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.training import detection_variables, make_optimizer, make_state
@@ -77,7 +77,7 @@ def test_recording_a_score_does_not_change_the_arrays(copy):
     changed = [path for path, content in contents(copy.folder).items() if content != before[path]]
     assert changed == ["00000006/checkpoint.json"]
     assert load_checkpoint(copy.folder / "00000006").score == 0.7
-    assert bits(copy.newest(shapes())[1]) == bits(state_at(6))
+    assert bits(copy.newest(shapes())) == bits(state_at(6))
     Checkpoints(copy.folder, keep=1).record_score(6, 0.8)
     assert steps(copy) == [6]  # step 2 was the best before
 
@@ -93,7 +93,7 @@ def test_a_kill_while_a_score_is_recorded_does_not_damage_the_checkpoint(copy, t
         with pytest.raises(KeyboardInterrupt):
             copy.record_score(6, 0.7)
     assert len(list(left.folder.glob(".*"))) == 1
-    assert left.newest(shapes())[0].step == 6
+    assert int(left.newest(shapes()).step) == 6
     save(left, 7)
     assert list(left.folder.glob(".*")) == []  # the next save tidies up
 
@@ -118,7 +118,7 @@ def test_an_interruption_of_the_replacement_keeps_the_old_checkpoint(copy, monke
 def test_corrupt_checkpoints_are_skipped_with_a_warning(copy, capsys):
     truncate(copy.folder / "00000006")
     (copy.folder / "00000004" / "checkpoint.json").write_text("{")
-    assert bits(copy.newest(state_at(0))[1]) == bits(state_at(2))
+    assert bits(copy.newest(state_at(0))) == bits(state_at(2))
     first, second = capsys.readouterr().err.splitlines()
     for line, step in ((first, "00000006"), (second, "00000004")):
         assert line.startswith("warning: ")
@@ -141,7 +141,7 @@ def test_a_checkpoint_without_its_description_is_replaced_by_the_run(copy):
     """The run resumed from step 4 and reaches step 6 again."""
     (copy.folder / "00000006" / "checkpoint.json").unlink()
     save(copy, 6, 0.2)
-    assert bits(copy.newest(state_at(0))[1]) == bits(state_at(6))
+    assert bits(copy.newest(state_at(0))) == bits(state_at(6))
     assert [path.name for path in copy.folder.glob(".*")] == []
 
 
@@ -159,7 +159,7 @@ def test_an_intact_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_corrupt
         raise error
 
     monkeypatch.setattr(storage, "_checkpointer", failing)
-    with pytest.raises(CheckpointError, match="00000006/variables: cannot be read") as raised:
+    with pytest.raises(CheckpointError, match="00000006/state: cannot be read") as raised:
         copy.newest(state_at(0))
     assert raised.value.__cause__ is error
 
@@ -189,9 +189,3 @@ def test_a_run_stands_for_its_last_or_best_checkpoint(copy):
     assert find_checkpoint(copy.folder / "00000004") == copy.folder / "00000004"
     shutil.rmtree(copy.folder)
     assert [find_checkpoint(path) for path in (run, run / "best")] == [run, run / "best"]
-
-
-def test_runs_are_loaded_like_checkpoints(copy):
-    run = copy.folder.parent
-    assert load_checkpoint(run / "best").step == 2
-    assert int(load_state(run, state_at(0)).step) == 6

@@ -89,12 +89,8 @@ def test_a_dropped_object_does_not_exclude_others(tmp_path):
     points = np.zeros((30, 5), np.float32)
     points[:, 0] = np.repeat([9, 13, 17], 10)
     frame = Frame(points, boxes, np.zeros(3, np.int32), np.full(3, 10, np.int32))
-    objects, empty, targets = (
-        prepare_database(ListedFrames((frame,)), tmp_path),
-        without_boxes(frame),
-        (3,) + (0,) * 9,
-    )
-    pasted = [pasted_into(empty, objects, seed=seed, targets=targets)[0] for seed in range(20)]
+    objects, targets = prepare_database(ListedFrames((frame,)), tmp_path), (3,) + (0,) * 9
+    pasted = [pasted_into(without_boxes(frame), objects, seed=seed, targets=targets)[0] for seed in range(20)]
     assert {tuple(sorted(paste.boxes[:, 0])) for paste in pasted} == {(13,), (10, 16)}
 
 

@@ -225,32 +225,11 @@ def test_a_frame_without_boxes_and_points_gives_an_empty_sample():
     assert not batch.batch.box_valid.any()
 
 
-LEFT_EARLY = """
-import dataclasses
-from fcos_lidar_jax.input_pipeline.loader import make_batches
-from fcos_lidar_jax.presets import QUICKSTART
-from toy_frames import ToyFrames
-if __name__ == "__main__":
-    # Shared memory of this size is freed slowly.
-    large = dataclasses.replace(QUICKSTART, max_points=300_000, class_balanced=False)
-    with make_batches(ToyFrames(), large, seed=0, num_steps=6, threads=1, workers=1) as batches:
-        print(len({next(batches).batch.points.shape, next(batches).batch.points.shape}))
-"""
-
-
-@pytest.mark.slow
-def test_a_run_that_ends_early_prints_no_warning(tmp_path):
-    script = tmp_path / "leave.py"
-    script.write_text(LEFT_EARLY)
-    done = run_python(script)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
-
-
 @pytest.mark.slow
 def test_batches_of_workers_are_the_same_and_signals_are_left_to_the_main_process(alone, objects):
     options = {"seed": 0, "num_steps": STEPS, "threads": 2, "objects": objects, "workers": 2}
     with make_batches(ToyFrames(), CONFIG, **options) as stream:
-        found = [next(stream)]
+        found = [next(stream), next(stream)]  # one of each worker, which has then begun
         for process in multiprocessing.active_children():
             os.kill(process.pid, signal.SIGTERM)
             os.kill(process.pid, signal.SIGINT)
@@ -303,26 +282,28 @@ def test_no_frames_are_refused():
         run(ToyFrames(0))
 
 
-ORPHANED = """
+SCRIPT = """
 import dataclasses, multiprocessing, os, signal
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.presets import QUICKSTART
 from toy_frames import ToyFrames
 if __name__ == "__main__":
-    config = dataclasses.replace(QUICKSTART, class_balanced=False)
-    with make_batches(ToyFrames(), config, seed=0, num_steps=6, threads=1, workers=1) as batches:
-        next(batches)
+    # Shared memory of this size is freed slowly.
+    large = dataclasses.replace(QUICKSTART, max_points=300_000, class_balanced=False)
+    with make_batches(ToyFrames(), large, seed=0, num_steps=6, threads=1, workers=1) as batches:
+        print(len({next(batches).batch.points.shape, next(batches).batch.points.shape}))
         print(*[process.pid for process in multiprocessing.active_children()], flush=True)
-        os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 @pytest.mark.slow
-def test_workers_end_when_the_main_process_is_killed(tmp_path):
-    script = tmp_path / "orphaned.py"
-    script.write_text(ORPHANED)
+@pytest.mark.parametrize("killed", [False, True])
+def test_workers_end_with_a_run_that_ends_early_or_is_killed_and_nothing_is_told(tmp_path, killed):
+    script = tmp_path / "leave.py"
+    script.write_text(SCRIPT + killed * "        os.kill(os.getpid(), signal.SIGKILL)")
     done = run_python(script)
-    assert done.returncode == -signal.SIGKILL
-    left = {int(number) for number in done.stdout.split()}
-    assert left
+    assert done.returncode == (-signal.SIGKILL if killed else 0)
+    shapes, *left = done.stdout.split()
+    assert (shapes, len(left)) == ("1", 1)
     wait_until(lambda: not any(Path(f"/proc/{number}").exists() for number in left), 30)
+    assert killed or not done.stderr

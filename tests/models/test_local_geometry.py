@@ -1,16 +1,13 @@
 """Local geometry: its definition in loops, its borders, and its place in the network."""
 
-import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_run import CONFIG, SENSOR
 
 from fcos_lidar_jax.locations import STRIDES
-from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.models.heads import Head, Heads
 from fcos_lidar_jax.models.layers import EPSILON
 from fcos_lidar_jax.models.local_geometry import (
@@ -115,16 +112,6 @@ def test_offsets_between_rounds_are_their_definition_in_loops(rounds):
         assert len(np.unique(expected[..., 3::5])) > 9
 
 
-def own_by_loops(image, rounds: int):
-    """Channels of the first round by name, pixel by pixel."""
-    names = "z", "range", "inclination", "intensity", "existence"
-    found = np.zeros((*SHAPE, len(names)))
-    for place in np.ndindex(*SHAPE):
-        for k, name in enumerate(names):
-            found[(*place, k)] = image[(*place, CHANNELS.index(name) * rounds)]
-    return found
-
-
 def test_features_are_two_layers_of_the_offsets_and_of_the_points_own_numbers():
     image, points = image_of(rounds=2)
     module = LocalGeometry(5, MEAN, SCALE)
@@ -132,7 +119,9 @@ def test_features_are_two_layers_of_the_offsets_and_of_the_points_own_numbers():
     rng = np.random.default_rng(1)
     variables = jax.tree.map(lambda leaf: jnp.asarray(rng.uniform(0.1, 1, leaf.shape), jnp.float32), shapes)
     variables["params"]["linear0"] -= 0.5
-    x = np.concatenate([by_loops(points, circular=False), own_by_loops(image, 2)], axis=-1)
+    names = "z", "range", "inclination", "intensity", "existence"
+    own = np.stack([image[..., 2 * CHANNELS.index(name)] for name in names], axis=-1)
+    x = np.concatenate([by_loops(points, circular=False), own], axis=-1)
     for layer in range(2):
         p, s = variables["params"], variables["batch_stats"][f"norm{layer}"]
         y = x @ np.asarray(p[f"linear{layer}"], np.float64)
@@ -161,21 +150,17 @@ def test_gradients_are_finite_where_nothing_is_near():
 
 
 @pytest.mark.parametrize("tied", [False, True])
-def test_it_joins_both_towers_of_each_head(tied):
-    model = dataclasses.replace(CONFIG.model, local_geometry=True, tied_heads=tied)
-    detector = build_detector(dataclasses.replace(CONFIG, model=model), SENSOR)
-    heads = jax.eval_shape(detector.init, jax.random.key(0))["params"]["heads"]
-    assert len(heads) == (1 if tied else len(STRIDES))
-    assert all({"classification_local", "regression_local"} <= head.keys() for head in heads.values())
-
-
-def test_it_joins_the_heads_of_every_level_and_nothing_else_changes():
+def test_it_joins_the_heads_of_every_level_and_nothing_else_changes(tied):
     rng = np.random.default_rng(0)
     shapes = [(1, 8 // stride or 1, 16 // stride or 1, 8) for stride in STRIDES[:4]]
     levels, local = ([jnp.asarray(rng.uniform(size=shape), jnp.float32) for shape in shapes] for _ in range(2))
-    heads = Heads(3, 8, 1, 0.9, tied=True)
+    heads = Heads(3, 8, 1, 0.9, tied=tied)
     params = jax.jit(heads.init)(jax.random.key(0), levels, local)["params"]
-    plain = {"shared": {name: part for name, part in params["shared"].items() if not name.endswith("_local")}}
+    assert len(params) == (1 if tied else len(levels))
+    plain = {
+        head: {name: part for name, part in parts.items() if not name.endswith("_local")}
+        for head, parts in params.items()
+    }
     apply = jax.jit(heads.apply)
     expected = apply({"params": plain}, levels)
     silent = apply({"params": params}, levels, jax.tree.map(jnp.zeros_like, local))

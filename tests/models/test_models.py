@@ -124,10 +124,8 @@ def stem_of_groups(params, image, config):
 
     groups, merged = channel_groups(config, image.shape[-1] // 9), jnp.zeros(())
     for index, d in enumerate(config.dilations):
-        branch, features = (
-            params[f"branch{index}"],
-            jnp.split(image, np.cumsum([i for i, _ in groups])[:-1], axis=-1),
-        )
+        branch = params[f"branch{index}"]
+        features = jnp.split(image, np.cumsum([i for i, _ in groups])[:-1], axis=-1)
         ends = np.cumsum([o for _, o in groups])[:-1]
         for layer in range(config.num_convs):
             scales, biases = (jnp.split(branch[f"norm{layer}"][name], ends) for name in ("scale", "bias"))

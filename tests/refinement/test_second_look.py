@@ -235,11 +235,12 @@ def test_training_starts_from_weights_with_or_without_a_second_look(tmp_path, ca
     def of_detector(variables):
         return bits({name: part for name, part in variables["params"].items() if name != "refinement"})
 
+    anew = "arrays start with random weights"
     for given, own, told in (
-        (None, SMALL, "has no second look: it starts with random weights"),
+        (None, SMALL, f"21 of 21 {anew}, 0 are left out"),
         (SMALL, None, "the second look is left out"),
-        (ALONE, SMALL, "has another second look: 9 of 21 arrays start with random weights, 0 are left out"),
-        (SMALL, ALONE, "has another second look: 0 of 12 arrays start with random weights, 9 are left out"),
+        (ALONE, SMALL, f"9 of 21 {anew}, 0 are left out"),
+        (SMALL, ALONE, f"0 of 12 {anew}, 9 are left out"),
     ):
         model, variables = detector(given)
         save_checkpoint(tmp_path / "weights", Checkpoint(model.config, SENSOR, variables, 1))

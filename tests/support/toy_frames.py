@@ -1,7 +1,6 @@
 """Small frame sets that worker processes can import."""
 
 import dataclasses
-import time
 
 import numpy as np
 
@@ -37,14 +36,12 @@ class ToyFrames(FrameSet):
     """Frames of :func:`toy_frame`."""
 
     size: int = 7
-    delay_s: float = 0.0  # per frame, for builds that are killed before their end
     classes, sensor = NUSCENES_CLASSES, NUSCENES_HDL32E
 
     def __len__(self) -> int:
         return self.size
 
     def frame(self, index: int) -> Frame:
-        time.sleep(self.delay_s)
         return toy_frame(index)
 
     def labels(self, index: int) -> np.ndarray:

@@ -5,7 +5,8 @@ import resource
 from pathlib import Path
 
 import pytest
-from event_files import SESSION_LOG, STEP, fields, read_events, summaries
+from event_files import read_events, summaries
+from tensorboardX.proto.event_pb2 import SessionLog
 
 from fcos_lidar_jax.training.metrics_log import MetricsLog, read_metrics
 
@@ -57,9 +58,9 @@ def test_tensorboard_gets_every_number_and_the_step_of_a_resumption(tmp_path):
     expected = {1: (10.0, 1.0, 1.0, 0.0), 2: (5.0, 2.0, 2.0, 0.0)}
     assert values == {(tag, step): v for step, row in expected.items() for tag, v in zip(tags, row, strict=True)}
     write(tmp_path, [2, 3], first_step=1)
-    starts = [event for event in read_events(tmp_path / "tensorboard") if SESSION_LOG in event]
-    # TensorBoard then drops earlier events from step 2 on; 1 is START.
-    assert (starts[-1][STEP], dict(fields(starts[-1][SESSION_LOG]))) == (2, {1: 1})
+    starts = [event for event in read_events(tmp_path / "tensorboard") if event.HasField("session_log")]
+    # TensorBoard then drops earlier events from step 2 on.
+    assert (starts[-1].step, starts[-1].session_log.status) == (2, SessionLog.START)
 
 
 def test_a_full_disk_raises_at_once_and_nothing_is_printed(tmp_path, capfd):
