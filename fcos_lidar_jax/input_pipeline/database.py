@@ -139,7 +139,9 @@ def cut_reading(num_sweeps: int) -> CloudReading:
 
 def objects_folder(index: Path, split: str | None) -> Path:
     """The database folder of a split; splits are separate, so that no validation object enters the training."""
-    return index / "objects" / (split or "all_frames")
+    name = split or "all_frames"
+    check(Path(name).name == name != "..", "split", name, "a name that a folder can have")
+    return index / "objects" / name
 
 
 def prepare_database(

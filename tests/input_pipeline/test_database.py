@@ -13,7 +13,7 @@ from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import InMemoryFrames
-from fcos_lidar_jax.input_pipeline.database import open_database, prepare_database, shards_by_scene
+from fcos_lidar_jax.input_pipeline.database import objects_folder, open_database, prepare_database, shards_by_scene
 from fcos_lidar_jax.sensors import ARGOVERSE2
 
 SCENES = (("scene-b", (0, 1, 2)), ("scene-a", (3,)), ("scene-c", (6, 4)))
@@ -94,6 +94,12 @@ def test_boxes_are_counted_and_most_of_them_without_points_give_a_warning(tmp_pa
             assert f"{boxes} boxes, {len(objects)} with at least 1 points\n" in told
             line = f"warning: {empty} of {boxes} boxes contain no point, expected few: are points and boxes in"
             assert (line in told) == bool(empty)
+
+
+def test_a_split_name_cannot_lead_out_of_the_index():
+    for name in ("../elsewhere", "..", ".", "a/b", "/tmp"):
+        with refused("expected a name that a folder can have"):
+            objects_folder(Path("index"), name)
 
 
 def test_the_fingerprint_depends_on_the_objects_only(tmp_path):
