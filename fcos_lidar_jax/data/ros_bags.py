@@ -149,7 +149,8 @@ class _Bag(contextlib.AbstractContextManager):
             for (topic, kind), count in sorted(self.counts.items())
             if not fitting or kind in types
         ]
-        topics = ", ".join(listed[:_MAX_LISTED]) or "none"
+        more = ["..."] if len(listed) > _MAX_LISTED else []
+        topics = ", ".join(listed[:_MAX_LISTED] + more) or "none"
         found = f"{len(fitting)} topics and no name" if name is None else repr(name)
         raise ValueError(f"{self.path}: {option}: got {found}, expected a topic of {names} among: {topics}")
 
