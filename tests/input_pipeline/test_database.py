@@ -232,6 +232,16 @@ def test_a_database_of_other_data_is_refused(tmp_path):
         open_database(tmp_path, fingerprint="g")
 
 
+def test_objects_of_changed_clouds_are_cut_again(tmp_path, monkeypatch):
+    points = []
+    for size in (1.0, 2.0):  # The frames change, and with them only the state of their files.
+        monkeypatch.setattr(SceneFrames, "clouds_fingerprint", lambda *_, size=size: f"{size:g}")
+        frame = toy_frame(0)
+        frames = ListedFrames((dataclasses.replace(frame, points=frame.points * np.float32([1, 1, 1, size, 1])),))
+        points.append(build(tmp_path, frames, scenes=(("s", (0,)),)).points(0))
+    np.testing.assert_allclose(points[1], points[0] * [1, 1, 1, 2, 1])
+
+
 def test_objects_have_the_columns_of_the_sensor(tmp_path):
     frames = InMemoryFrames((toy_frame(1, columns=6),), ARGOVERSE2, NUSCENES_CLASSES)
     assert build(tmp_path, frames, scenes=(("s", (0,)),)).points(0).shape[1] == 6
