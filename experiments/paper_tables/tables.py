@@ -296,7 +296,9 @@ def draw_learning(table: Table, record: dict[str, Any], path: Path) -> None:
             axis.plot(curve[:, 0], 100 * curve[:, 1], color=f"C{i}", linewidth=0.5)
         mean = np.mean(curves, axis=0)
         axis.plot(mean[:, 0], 100 * mean[:, 1], color=f"C{i}", linewidth=2, label=row["label"])
-    axis.set(xlabel="samples seen", ylabel="mAP", ylim=(0, None))
+    looked = record["trained_on"]["reference"]["refinement"] is not None  # trained on the finished detector
+    score = f"mAP{' before the second look' if looked else ''}"
+    axis.set(xlabel="samples seen", ylabel=score, ylim=(0, None))
     number = len(record["seeds"])
     trained = f"{record['scale']}, {number} seed{'s' if number > 1 else ''}"
     axis.set_title(f"{table.title} ({trained})", fontsize=11)
