@@ -301,7 +301,7 @@ def draw_learning(table: Table, record: dict[str, Any], path: Path) -> None:
     axis.set(xlabel="samples seen", ylabel=score, ylim=(0, None))
     number = len(record["seeds"])
     trained = f"{record['scale']}, {number} seed{'s' if number > 1 else ''}"
-    axis.set_title(f"{table.title} ({trained})", fontsize=11)
+    axis.set_title(f"{table.title}\n({trained})", fontsize=11)
     axis.legend(fontsize=9, frameon=False)
     axis.spines[["top", "right"]].set_visible(False)
     save_png(figure, path)
