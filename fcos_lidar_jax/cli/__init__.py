@@ -117,7 +117,7 @@ def _explain(error: Exception) -> str | None:
         expected = 'a platform of this machine, or, for NVIDIA GPUs, pip install -U "jax[cuda13]"'
         return f"{name}: got {os.environ.get(name)!r}, expected {expected}: {text}"
     if isinstance(error, RuntimeError) and "Gloo" in text:  # JAX's connection between processes on CPUs
-        return f"another process ended, see its output, or the connection between the processes failed: {text}"
+        return f"another process ended, or the connection to it failed; see its output: {text}"
     if isinstance(error, ValueError | OSError | ArithmeticError):
         return text or f"{type(error).__name__} without a message"
     return None

@@ -61,6 +61,11 @@ class DataOptions:
             return given
         return default_split(self.data_set, purpose, required=required, splits=self.splits)
 
+    def refuse_index(self, why: str) -> None:
+        """Reject --index where it would be ignored."""
+        if self.index is not None:
+            raise ValueError(f"--index: got {self.index}, expected none: {why}")
+
     def open(
         self,
         config: Config,

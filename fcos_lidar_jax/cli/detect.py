@@ -19,13 +19,15 @@ from fcos_lidar_jax.data.cloud_policy import truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
+from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.progress import tell
+from fcos_lidar_jax.sensors import KITTI_HDL64E
 
-_LISTED = Excludes(("files",), "the list names the files")
+_LISTED = Excludes(("files", "full_turn"), "the list names the files, which keep all points")
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
 
@@ -69,6 +71,8 @@ class Detect:
 def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
     files, sweeps = _inputs(args.files, args.sweeps)
+    if args.full_turn and not any(usual_sensor(file) == KITTI_HDL64E for file in files):
+        raise ValueError(f"--full-turn: expected none for {files[0]}: only files of KITTI are cropped")
     parts = [Path(sweep.file) for sweep in sweeps]
     detector = load_detector(args.checkpoint, backend=args.backend)
     classes, config = detector.classes, detector.config

@@ -145,6 +145,8 @@ def _open(args: Evaluate) -> Task:
         comparison = compare_by_benchmark(read_truth(args.ground_truth), str(args.ground_truth))
         return Task(args.ground_truth.name, comparison, sensor)
     data = args.data.data_set
+    if data.tables is None:
+        args.data.refuse_index("only the tables of nuScenes have an index")
     has_benchmark = data.tables is not None and args.data.class_map is None
     if detector is None and not has_benchmark:
         expected = "--checkpoint too, for the classes of detections.json, or a folder of KITTI's result files"
@@ -152,6 +154,8 @@ def _open(args: Evaluate) -> Task:
     split = _split(args.data, args.split)
     name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), data.version, split)))
     if detector is None or (has_benchmark and set(detector.classes) <= set(NUSCENES_CLASSES)):
+        if detector is not None and args.results is not None:
+            raise ValueError("--results: got --checkpoint too, expected one of them for nuScenes")
         config = NUSCENES_SINGLE if detector is None else detector.config
         frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
         assert isinstance(frames, NuScenesFrames)

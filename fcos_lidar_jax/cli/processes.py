@@ -35,12 +35,12 @@ def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.
     is_address = by_hand is None or bool(re.fullmatch(r".+:\d{1,5}", by_hand))
     check(is_address, "--coordinator", by_hand, "HOST:PORT")
     cluster = by_hand or "--distributed"
-    launchers = "Slurm, Open MPI, a TPU pod, or --coordinator, --num-processes and --process-index"
+    more = (
+        "" if by_hand else "; expected Slurm, Open MPI, a TPU pod, or --coordinator and the options that it needs"
+    )
     place, ids = dataclasses.astuple(options)[1:], local_device_ids(environment)
     with (
-        refusing(
-            f"{cluster}: this process cannot join", ValueError, more="" if by_hand else f"; expected {launchers}"
-        ),
+        refusing(f"{cluster}: this process cannot join", ValueError, more=more),
         refusing(f"{cluster}: the processes did not connect", RuntimeError, kind=OSError),
     ):
         jax.distributed.initialize(*place, local_device_ids=ids)

@@ -176,6 +176,8 @@ def _open(args: Train) -> _Task:
         _check_simulated(len(frames), config)
     steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
     cuts_objects = config.copy_paste is not None and (args.samples is not None or not data.on_disk)
+    if data.tables is None and (config.copy_paste is None or cuts_objects):
+        args.data.refuse_index("no prepared objects are used")
     objects = args.out / _OBJECTS if cuts_objects else database.objects_folder(index, split)
     return _Task(config, split, frames, tests, steps, objects, cuts_objects)
 

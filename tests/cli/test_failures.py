@@ -40,7 +40,7 @@ def fail_with(error):
         (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: for training, --optimizer.accumulate"),
         (
             RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
-            "another process ended, see its output, or the",
+            "another process ended, or the connection to it",
         ),
         (ValueError("x" * 120_000), "x" * 900),
     ],

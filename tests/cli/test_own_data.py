@@ -80,6 +80,17 @@ def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_an_index_is_refused_where_it_would_be_ignored(tmp_path, capsys):
+    more = (
+        f"--data-root {make_folder(tmp_path / 'data', train=1, val=1)} --out {tmp_path}/out --index {tmp_path}/i"
+    )
+    train = f"train quickstart {more} --steps 1 --no-copy-paste --classes".split()
+    assert_one_line_error(capsys, [*train, *CLASSES], "--index: got .*, expected none: no prepared objects")
+    evaluate = f"evaluate {more} --checkpoint quickstart".split()
+    assert_one_line_error(capsys, evaluate, "--index: got .*, expected none: only the tables of nuScenes have an")
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
 def test_classes_that_the_data_do_not_have_are_named_in_a_warning(tmp_path, capsys):
     data = make_folder(tmp_path / "data", train=1, val=0)
     for name, warned in (("vehicel", True), ("vehicle", False)):
