@@ -43,6 +43,17 @@ def test_prints_a_record_and_a_second_run_changes_nothing(root, tmp_path, capsys
     assert all(f.stat().st_mtime_ns == stamp for f, stamp in stamps.items())
 
 
+def test_objects_come_only_from_the_training_split(root, tmp_path):
+    command(*prepare(root, tmp_path / "i", "--train-split", "scene-1"))
+    data = NuScenes(root, VERSION)
+    own, other = (
+        {b.tobytes() for t in data.split(s) for b in data.boxes(t).boxes} for s in ("scene-1", "scene-2")
+    )
+    boxes = {row["box"].tobytes() for row in open_database(tmp_path / "i" / "objects" / "scene-1").table}
+    assert boxes
+    assert boxes <= own - other
+
+
 @pytest.mark.slow
 def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     command(*prepare(root, tmp_path / "whole"))
