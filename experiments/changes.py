@@ -5,8 +5,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.presets import COMPACT, NUSCENES
+from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, COMPACT, NUSCENES
 
 Change = Callable[[Config], Config]
 
@@ -31,6 +32,14 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
     first, *rest = path
     inner = _replaced(getattr(config, first), rest, value) if rest else value
     return dataclasses.replace(config, **{first: inner})
+
+
+def as_centerpoint(config: Config) -> CenterPointConfig:
+    """CenterPoint with the sizes of its compact preset, and data and training of a configuration."""
+    own = {part: getattr(CENTERPOINT_COMPACT, part) for part in ("model", "loss", "pillars")}
+    # Candidates of the range view on all levels; the coarsest have less than 1000 each.
+    shared = change(inference__iou_exponent=1.0, inference__candidates_per_level=4450)
+    return CenterPointConfig.of(shared(config), **own)
 
 
 SLIM = change(

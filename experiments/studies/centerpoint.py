@@ -28,16 +28,13 @@ import jax
 import numpy as np
 
 from experiments.benchmarks.latency import stage_calls
-from experiments.changes import FROZEN_LOOK, change
+from experiments.changes import FROZEN_LOOK, as_centerpoint, change
 from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
 from experiments.runs import training_steps
 from experiments.script import run_script
-from fcos_lidar_jax.centerpoint import CenterPointConfig
-from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector, count_parameters
-from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
 
 _STAGES = {
     "image or pillars": "preparation",
@@ -45,18 +42,11 @@ _STAGES = {
     "boxes": "post-processing",
     "second look": "second look",
 }
-_CANDIDATES = 4450  # Candidates of the range view on all levels; the coarsest have less than 1000 each.
-
-
-def _peer(config: Config) -> Config:
-    own = {part: getattr(CENTERPOINT_COMPACT, part) for part in ("model", "loss", "pillars")}
-    change_shared = change(inference__iou_exponent=1.0, inference__candidates_per_level=_CANDIDATES)
-    return CenterPointConfig.of(change_shared(config), **own)
 
 
 def _rows(sweeps: str, **fields: Any) -> tuple[Row, ...]:
     """Rows with a number of sweeps, compared with CenterPoint on the same sweeps."""
-    peer = Row(f"CenterPoint, {sweeps}", lambda config: _peer(change(**fields)(config)))
+    peer = Row(f"CenterPoint, {sweeps}", lambda config: as_centerpoint(change(**fields)(config)))
     ours = Row(f"FCOS-LiDAR, {sweeps}", change(model__local_geometry=True, **fields), reference=peer.label)
     plain = f"FCOS-LiDAR without local geometry, {sweeps}"
     return peer, ours, Row(plain, change(**fields), reference=peer.label)
