@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_poi
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, check_poses, fuse_sweeps
-from fcos_lidar_jax.files import refusing, some_files
+from fcos_lidar_jax.files import some_files
 from fcos_lidar_jax.geometry import pose_matrix, wrap_angle
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
 
@@ -160,8 +161,9 @@ def _stamps(log: Path) -> list[int]:
     """Times of a log's sweeps in nanoseconds, from the file names."""
     stamps = []
     for file in some_files(log / _SWEEPS, ".feather", "sweeps, TIMESTAMP.feather"):
-        with refusing(f"{file}: expected a name of whole nanoseconds", ValueError):
-            stamps.append(int(file.stem))
+        if not re.fullmatch("0|[1-9][0-9]*", file.stem):
+            raise ValueError(f"{file}: got {file.stem!r}, expected a name of whole nanoseconds")
+        stamps.append(int(file.stem))
     return sorted(stamps)
 
 

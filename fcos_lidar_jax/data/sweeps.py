@@ -19,8 +19,8 @@ from fcos_lidar_jax.sensors import Sensor
 _GAP_US = (1_000, 10_000_000)  # plausible mean time between sweeps; others are not microseconds
 FARTHEST_M = 1e8  # beyond any place on earth in any map's coordinates
 
-_Metres = Annotated[float, msgspec.Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
-_Row = tuple[_Metres, _Metres, _Metres, _Metres]
+Metres = Annotated[float, msgspec.Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
+_Row = tuple[Metres, Metres, Metres, Metres]
 
 
 @dataclasses.dataclass(frozen=True)

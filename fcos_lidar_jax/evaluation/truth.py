@@ -9,6 +9,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.names import BICYCLE_RACK, label_of
+from fcos_lidar_jax.data.sweeps import Metres
 from fcos_lidar_jax.evaluation import json_io
 from fcos_lidar_jax.evaluation.boxes import (
     ATTRIBUTE_INDEX,
@@ -35,7 +36,7 @@ class Box(json_io.JsonBox, gc=False):
 class Sample(msgspec.Struct, gc=False):
     """Annotations of one keyframe."""
 
-    ego_translation: json_io.Vector
+    ego_translation: tuple[Metres, Metres, Metres]
     boxes: list[Box]
 
 
@@ -53,6 +54,8 @@ def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
         columns, rotation = json_io.geometry(boxes, where)
         parts.append(make_columns(sample=row, label=label, attribute=attribute, num_points=points, **columns))
         rotations.append(rotation)
+    if not ego:
+        raise ValueError(f"{name}: got no samples, expected at least one")
     return _ground_truth(ego, list(ego.values()), join(parts), np.concatenate(rotations))
 
 

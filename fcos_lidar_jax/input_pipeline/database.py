@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.box_geometry import points_in_boxes
+from fcos_lidar_jax.data.box_geometry import check_boxes, points_in_boxes
 from fcos_lidar_jax.data.cloud_policy import unusable_cloud, unusable_clouds, usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.npy_files import parse_npz
@@ -168,8 +168,8 @@ def prepare_database(
             shard.
 
     Raises:
-        ValueError: more sweeps than :data:`MAX_SWEEPS`, or missing files, before a frame is read; no frame has
-            usable points.
+        ValueError: more sweeps than :data:`MAX_SWEEPS`, or missing files, before a frame is read; a frame has an
+            implausible box; no frame has usable points.
         OSError: an error of the file system, or a worker died.
     """
     folder = Path(folder)
@@ -266,6 +266,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     num_boxes, start = np.zeros(2, np.int64), 0
     for index in job.indices:
         frame = frames.frame(index)
+        check_boxes(frame.boxes, lambda box, index=index: f"frame {frames.name(index)!r}: box {box}")
         usable = np.asarray(usable_rows(frame.points))
         if line := unusable_cloud(frames.name(index), frame.points, usable, frame.num_close, frames.sensor):
             unusable.append(line)

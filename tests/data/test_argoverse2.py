@@ -1,5 +1,6 @@
 """Argoverse 2: logs written by hand in the official layout against plain geometry; one-line errors."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -143,7 +144,7 @@ def test_annotations_are_read_again_after_a_change_and_may_be_missing(root):
     assert (len(frame.points), frame.boxes.shape, frame.labels.tolist()) == (4, (0, 9), [])
 
 
-FIRST = "sensors/lidar/first.feather"
+FIRST, ZERO = "sensors/lidar/first.feather", f"sensors/lidar/0{START_NS}.feather"
 A, P, S = "annotations.feather", "city_SE3_egovehicle.feather", f"sensors/lidar/{START_NS}.feather"
 
 
@@ -188,6 +189,7 @@ BAD = {
     "box without a pose": (boxes(time_ns=5), P, "no pose at 5 ns, expected one for every"),
     "sweep without a pose": (late, P, f"no pose at {START_NS} ns, expected one for every sweep"),
     "name": (lambda log: (log / S).rename(log / FIRST), FIRST, "expected a name of whole nanosec"),
+    "leading zero": (lambda log: shutil.copy(log / S, log / ZERO), ZERO, "expected a name of whole nanosec"),
 }
 
 

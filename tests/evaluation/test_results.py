@@ -114,6 +114,8 @@ def truth(**changes):
         (truth(num_pts=-2), "sample a: box 1: num_pts: got -2, expected a count, or -1 for unknown"),
         ({"a": {"boxes": []}}, "sample a: object missing required field `ego_translation`"),
         ({"a": {"ego_translation": [0, 0, float("nan")], "boxes": []}}, r"sample a: ego_translation\[2\]"),
+        ({"a": {"ego_translation": [0, 0, 1e200], "boxes": []}}, r"sample a: ego_translation\[2\]"),
+        ({}, "got no samples, expected at least one"),
     ],
 )
 def test_invalid_truth_is_named(source, message, tmp_path):

@@ -114,6 +114,13 @@ def test_more_sweeps_than_are_counted_are_refused_before_the_build(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_implausible_box_is_refused(tmp_path):
+    frame = toy_frame(0)
+    frame.boxes[3, 4] = 0
+    with refused("frame 'frame 1': box 3: w: got 0, expected a size above 0 m"):
+        build(tmp_path, ListedFrames((toy_frame(1), frame)), scenes=(("s", (0, 1)),))
+
+
 def test_each_scene_is_a_shard(tmp_path):
     """Frames without a scene form shards of a hundred; scene names become valid file names."""
     frames = SceneFrames(
