@@ -28,11 +28,11 @@ class CenterPointConfig(Config):
         super().__post_init__()
         check_per_class("pillars.groups", self.pillars.groups, self.classes)
         check(self.model == ModelConfig(), "model", "changes", "the default: pillars takes its place")
-        for name in _RANGE_VIEW_LOSSES:
-            own, default = getattr(self.loss, name), getattr(LossConfig(), name)
-            check(own == default, f"loss.{name}", own, f"{default!r} with pillars, which do not use it")
-        exponent = self.inference.iou_exponent
-        check(exponent == 1, "inference.iou_exponent", exponent, "1 with pillars, which predict no IoU")
+        unused = [
+            (f"loss.{name}", getattr(self.loss, name), getattr(LossConfig(), name)) for name in _RANGE_VIEW_LOSSES
+        ]
+        for name, own, default in (*unused, ("inference.iou_exponent", self.inference.iou_exponent, 1.0)):
+            check(own == default, name, own, f"{default!r} with pillars, which do not use it")
 
     def with_doubled_classes(self, **changes: Any) -> Self:
         doubled = dataclasses.replace(self.pillars, groups=2 * self.pillars.groups)

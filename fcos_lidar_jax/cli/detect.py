@@ -121,5 +121,7 @@ def _inputs(inputs: tuple[Path, ...], listed: Path | None) -> tuple[tuple[Path, 
         for file in find_clouds(inputs):
             distinct.setdefault(os.path.abspath(file), file)
         return tuple(distinct.values()), []
+    if listed.suffix != ".json":
+        raise ValueError(f"--sweeps: {listed}: expected a file that ends in .json")
     sweeps = read_list(listed)
     return (listed,), [msgspec.structs.replace(each, file=str(listed.parent / each.file)) for each in sweeps]

@@ -23,7 +23,7 @@ from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.kitti import KittiFrames, cropped
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
-from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark, compare_by_distance
+from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, score_kitti
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
@@ -34,6 +34,7 @@ from fcos_lidar_jax.inference.alignment import heading, other_rows
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.visualization.evaluation_report import PAGE
 
 _TOO_HIGH = "scores on training frames are too high"
 _NO_DETECTION = Excludes(("backend", "batch_size", "yaw_deg", "distributed", "coordinator"), "nothing is detected")
@@ -41,6 +42,7 @@ _NO_DATA = Excludes(
     ("checkpoint", "data_root", "format", "class_map", "split", "samples"), "it takes the place of a data set"
 )
 _ONE_PROCESS = Excludes(("distributed", "coordinator"), "only xla runs in several processes")
+_WRITTEN = ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +90,7 @@ class Evaluate:
 
 def run(args: Evaluate) -> None:
     """Detect if a detector is given, evaluate, write, and print the scores."""
+    _check_written(args)
     is_folder = args.results is not None and args.results.is_dir() and args.ground_truth is None
     if is_folder and args.data.data_set.reader.result_folders:
         return _score_kitti_results(args)
@@ -97,8 +100,6 @@ def run(args: Evaluate) -> None:
         with agreed("cannot evaluate"):
             task = _open(args)
             results = args.out / task.comparison.file
-            if args.ground_truth is not None:
-                check_out_file("--out", results, keep=[args.ground_truth])
             # Given files are read and checked before anything is written.
             compared = None if args.results is None else task.comparison.read(args.results)
             if is_main_process:
@@ -120,13 +121,22 @@ def run(args: Evaluate) -> None:
                 print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
 
 
+def _check_written(args: Evaluate) -> None:
+    """Reject a folder in which a file would replace an input. The results may be in it already."""
+    for name in (*_WRITTEN, *RESULT_FILES):
+        inputs = args.ground_truth, None if name in RESULT_FILES else args.results
+        check_out_file("--out", args.out / name, keep=[file for file in inputs if file is not None])
+
+
 def _score_kitti_results(args: Evaluate) -> None:
     """Compute KITTI's metric of a folder of result files."""
     assert args.results is not None
-    ignored = {name: getattr(args, name) for name in ("checkpoint", "samples", "bootstrap", "rrd")}
-    for name, value in (ignored | {"class_map": args.data.class_map}).items():
-        if value:
-            raise ValueError(f"{option_name(name)}: got {value}, expected none with a folder of results")
+    data = DataOptions(args.data.data_root, args.data.format, splits=args.data.splits)
+    used = {name: getattr(args, name) for name in ("out", "split", "results", "report", "processes")}
+    for given, usual in ((args.data, data), (args, Evaluate(data, **used))):
+        for name in (field.name for field in dataclasses.fields(given) if field.name != "data"):
+            if (value := getattr(given, name)) != getattr(usual, name):
+                raise ValueError(f"{option_name(name)}: got {value}, expected none with a folder of results")
     split = _split(args.data, args.split)
     frames = args.data.open_whole(split, CloudReading())
     assert isinstance(frames, KittiFrames)

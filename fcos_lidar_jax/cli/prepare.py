@@ -14,6 +14,7 @@ import tyro
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
+from fcos_lidar_jax.data.folder import belongs_to_own_data
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
 from fcos_lidar_jax.fields import Count
@@ -53,6 +54,8 @@ def run(args: Prepare) -> None:
     more = "; name one by --index, here and for train"
     with refusing("--index", PermissionError, kind=PermissionError, more=more):
         check_writable(folder / ".lock")
+    if belongs_to_own_data(folder / "objects"):
+        raise ValueError(f"--index: {folder}: a folder of own data, expected another one")
     jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
     tell(f"writing to {folder}" + ("" if args.data.index else "; --index names another folder"))
     with folder_lock(folder, "preparing"):

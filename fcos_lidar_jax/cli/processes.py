@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -32,8 +31,9 @@ def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.
     by_hand = options.coordinator
     if by_hand is None and not options.distributed:
         return
-    is_address = by_hand is None or bool(re.fullmatch(r".+:\d{1,5}", by_hand))
-    check(is_address, "--coordinator", by_hand, "HOST:PORT")
+    if by_hand is not None:
+        host, _, port = by_hand.rpartition(":")
+        check(bool(host) and port.isdecimal() and 0 < int(port) < 2**16, "--coordinator", by_hand, "HOST:PORT")
     cluster = by_hand or "--distributed"
     more = (
         "" if by_hand else "; expected Slurm, Open MPI, a TPU pod, or --coordinator and the options that it needs"

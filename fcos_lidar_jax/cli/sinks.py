@@ -47,6 +47,7 @@ def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Seq
         if not posed:
             raise ValueError(f"{option}: found no poses, expected some: the boxes are in the global frame")
     if args.output_format == "kitti":
+        check(any(name.lower() in _TYPES for name in classes), option, ", ".join(classes), "some classes of KITTI")
         stems = [_stem(cloud, number) for number, cloud in enumerate(clouds)]
         if len(set(stems)) < len(stems):
             raise ValueError(f"{option}: got clouds of the same name, expected different names")

@@ -139,7 +139,7 @@ class _Task:
     frames: FrameSet
     tests: FrameSet | None
     steps: int
-    objects: Path  # folder of the objects to paste
+    objects: Path | None  # folder of the objects to paste; None without copy-paste
     cuts_objects: bool  # they come only from these frames and are stored in the run's folder
 
 
@@ -176,9 +176,11 @@ def _open(args: Train) -> _Task:
         _check_simulated(len(frames), config)
     steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
     cuts_objects = config.copy_paste is not None and (args.samples is not None or not data.on_disk)
-    if data.tables is None and (config.copy_paste is None or cuts_objects):
+    objects = args.out / _OBJECTS if cuts_objects else None
+    if config.copy_paste is not None and not cuts_objects:
+        objects = database.objects_folder(index, split)
+    elif data.tables is None:
         args.data.refuse_index("no prepared objects are used")
-    objects = args.out / _OBJECTS if cuts_objects else database.objects_folder(index, split)
     return _Task(config, split, frames, tests, steps, objects, cuts_objects)
 
 
@@ -199,9 +201,10 @@ def _open_tests(args: Train, config: Config) -> FrameSet | None:
     split = args.data.split("val", args.val_split, required=False)
     if split != "none" and (split is not None or args.val_samples):
         return args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
+    expected = "frames to evaluate on: --val-split, or --val-samples where there are no splits"
     for name in ("val_samples", "evaluate_every"):
         if (given := getattr(args, name)) is not None:
-            raise ValueError(f"{option_name(name)}: got {given!r}, expected a split to evaluate on (--val-split)")
+            raise ValueError(f"{option_name(name)}: got {given!r}, expected {expected}")
     return None
 
 
@@ -216,6 +219,7 @@ def _check_simulated(number: int, config: Config) -> None:
 
 def _cut_objects(task: _Task) -> None:
     assert task.config.copy_paste is not None
+    assert task.objects is not None
     min_points, num_sweeps = task.config.copy_paste.min_points, task.config.num_sweeps
     database.prepare_database(task.frames, task.objects, min_points=min_points, num_sweeps=num_sweeps)
 
@@ -223,7 +227,7 @@ def _cut_objects(task: _Task) -> None:
 def _objects(task: _Task, data: DataOptions) -> database.GroundTruthDatabase | None:
     """Open the objects to paste, just cut or prepared for the split; None without copy-paste."""
     folder, split = task.objects, task.split
-    if task.config.copy_paste is None:
+    if folder is None:
         return None
     if task.cuts_objects:
         # The folder is not locked since they were cut: another process may have cut others.

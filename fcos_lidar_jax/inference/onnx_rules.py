@@ -43,11 +43,15 @@ def translate(graph: Graph, program: ClosedJaxpr, inputs: Sequence[Value]) -> li
 
     for eqn in program.jaxpr.eqns:
         name = eqn.primitive.name
-        if name not in _RULES:
-            raise NotImplementedError(f"found the primitive {name}, which has no rule")
+        _expect(name in _RULES, f"the primitive {name}")
         results = _RULES[name](graph, eqn, *map(read, eqn.invars))
         values |= zip(eqn.outvars, results if isinstance(results, list) else [results], strict=True)
     return [read(variable) for variable in program.jaxpr.outvars]
+
+
+def _expect(has_rule: bool, found: str) -> None:
+    if not has_rule:
+        raise NotImplementedError(f"found {found}, which has no rule")
 
 
 def _rule(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -167,8 +171,7 @@ def _dynamic_slice(graph: Graph, eqn: Any, x: Value, *starts: Value) -> Value:
 @_rule("pad")
 def _pad(graph: Graph, eqn: Any, x: Value, value: Value) -> Value:
     low, high, interior = zip(*eqn.params["padding_config"], strict=True)
-    if any(interior):
-        raise NotImplementedError("found a pad between elements, which has no rule")
+    _expect(not any(interior), "a pad between elements")
     return graph("Pad", x, _ints([*low, *high]), value)
 
 
@@ -207,8 +210,8 @@ def _gather(graph: Graph, eqn: Any, x: Value, indices: Value) -> Value:
     order = [*axes, *(i for i in range(len(shape)) if i not in axes)]
     x = _permuted(graph, x, order)
     sizes = [shape[axis] for axis in order]
-    if [eqn.params["slice_sizes"][axis] for axis in order] != [1] * len(axes) + sizes[len(axes) :]:
-        raise NotImplementedError("found a gather of windows, which has no rule")
+    taken = [eqn.params["slice_sizes"][axis] for axis in order]
+    _expect(taken == [1] * len(axes) + sizes[len(axes) :], "a gather of windows")
     for axis in dims.start_indices_batching_dims:
         along = [count[axis] if i == axis else 1 for i in range(len(count))]
         own = graph("Expand", np.arange(count[axis]).reshape(along), _ints([*count[:-1], 1]))
@@ -233,8 +236,8 @@ def _scatter(graph: Graph, eqn: Any, x: Value, indices: Value, updates: Value) -
     order = [*axes, *(i for i in range(len(shape)) if i not in axes)]
     x = _permuted(graph, x, order)
     rest = [shape[axis] for axis in order[len(axes) :]]
-    if {*axes} != {*dims.inserted_window_dims} or [sizes[axis] for axis in windows] != rest:
-        raise NotImplementedError("found a scatter of windows, which has no rule")
+    is_single = {*axes} == {*dims.inserted_window_dims} and [sizes[axis] for axis in windows] == rest
+    _expect(is_single, "a scatter of windows")
     number, width = math.prod(shape[axis] for axis in axes), math.prod(rest)
     # Updates outside of the array go to an additional row.
     place, _ = _places(graph, indices, [shape[axis] for axis in axes], number)
@@ -254,8 +257,7 @@ def _scatter(graph: Graph, eqn: Any, x: Value, indices: Value, updates: Value) -
 def _scan(graph: Graph, eqn: Any, *inputs: Value) -> list[Value]:
     """Steps one after the other, as in a binary search."""
     fixed, number = eqn.params["num_consts"], eqn.params["num_carry"]
-    if len(inputs) != fixed + number or len(eqn.outvars) != number:
-        raise NotImplementedError("found a scan over arrays, which has no rule")
+    _expect(len(inputs) == fixed + number and len(eqn.outvars) == number, "a scan over arrays")
     state = [*inputs[fixed:]]
     for _ in range(eqn.params["length"]):
         state = translate(graph, eqn.params["jaxpr"], [*inputs[:fixed], *state])

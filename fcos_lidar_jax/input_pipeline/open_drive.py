@@ -74,9 +74,12 @@ RECORDINGS = (
 def find_recording(source: Path, *, scene: str | None = None, poses: Path | None = None) -> Recording:
     """The kind of a drive: a scene of the data set ``source``, or what ``source`` looks like.
 
-    With a file of poses, recordings that have poses of their own are read as folders of point files.
+    With a file of poses, recordings that have poses of their own are read as folders of point files. Refuses a
+    missing source.
     """
     if scene is not None:
         return SCENE
+    if not source.exists():
+        raise ValueError(f"{source}: no such file or folder")
     kinds = (kind for kind in RECORDINGS if kind.recognises is not None and kind.recognises(source))
     return next((kind for kind in kinds if poses is None or "poses" in kind.options), FOLDER)

@@ -39,7 +39,7 @@ from fcos_lidar_jax.training.step import make_state
 NUM_SEEDS = 2**32  # JAX uses 32 bits of a seed, so larger seeds would repeat smaller ones
 _MIN_EVALUATE_EVERY = 100
 """An evaluation of a whole split can take longer than so few steps, which hardly change the scores."""
-_NUM_INSPECTED = 10  # frames that are read before a run starts
+_NUM_INSPECTED = 20  # frames that are read before a run starts
 RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 
 Hook = Callable[[int, Record], None]

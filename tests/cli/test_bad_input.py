@@ -21,6 +21,7 @@ def home(tmp_path_factory):
     """Clouds, poses, a checkpoint, its export and a data set in the nuScenes layout."""
     folder = tmp_path_factory.mktemp("home")
     save_untrained(folder / "checkpoint")
+    save_untrained(folder / "cranes", dataclasses.replace(TINY_CONFIG, classes=("crane",)))
     command("export --checkpoint", folder / "checkpoint", "--out", folder / "detector.fcos")
     points = make_frame(0, TINY).points
     drive = folder / "training" / "velodyne"
@@ -55,6 +56,7 @@ detect HOME/training => training: no point file in it, expected [^;]*$
 detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
 detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, 
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
+detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
 detect --sweeps HOME/s.json --full-turn => --sweeps: got .*, expected none with --full-turn: 
 detect HOME/good.npy --full-turn => --full-turn: expected none for .*good.npy: only files of KITTI are cropped
 detect HOME/good.npy --min-score 50 => --min-score: got 50.0, expected within \[0, 1\]$
@@ -62,6 +64,7 @@ detect HOME/good.npy --labels submarine => --labels: got 'submarine', expected s
 detect HOME/good.npy --calibration HOME => --calibration: got .*, expected only with --output-format kitti$
 detect HOME/good.npy --output-format kitti => good.txt: no such file, expected --calibration
 detect LABELLED --output-format kitti --out HOME/labels => 0.txt: found labels, which have no score
+detect LABELLED --output-format kitti --checkpoint HOME/cranes => got .crane., expected some classes of KITTI
 detect HOME/good.npy --output-format nuscenes => --output-format nuscenes: found no poses
 detect HOME/good.npy --out HOME/good.npy => --out: .*the same file as .*good.npy
 detect HOME/good.npy --out OUT --page OUT => --page: .*the same file as .*out
@@ -73,7 +76,7 @@ detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*the place of t
 detect HOME/good.npy --checkpoint HOME/detector.fcos --batch-size 2 => batch size: got 2, expected 1
 detect HOME/none.npy --pictures HOME/good.npy => good.npy: found a file, expected a folder
 stream => SOURCE: got none, expected one, or --data-root$
-stream HOME/nowhere => nowhere: no such file, expected a point file
+stream HOME/nowhere --out OUT/x => nowhere: no such file or folder
 stream HOME/training/velodyne --track => --track: found no poses
 stream HOME/training/velodyne --keyframes => --keyframes: expected only with --data-root
 stream HOME/training/velodyne --output-format nuscenes => --output-format nuscenes: found no poses
@@ -86,6 +89,7 @@ evaluate --results HOME/truth.json => data root: missing, expected the folder of
 evaluate --checkpoint x --ground-truth HOME/truth.json => --ground-truth: .* expected none with --checkpoint
 evaluate --results x --ground-truth HOME/truth.json --batch-size 2 => --results: .* none with --batch-size
 evaluate --results x --ground-truth HOME/truth/results_nusc.json --out HOME/truth => --out: .*: the same file as
+evaluate --results x --ground-truth HOME/truth/curves.json --out HOME/truth => --out: .*: the same file as
 evaluate DATA --results x --class-map y => --results: x: expected --checkpoint too, for the classes
 evaluate DATA --split all --results x --checkpoint HOME/checkpoint => got --checkpoint too, expected one of
 evaluate DATA --checkpoint HOME/checkpoint --sensor tiny => --sensor: got tiny, expected none with --checkpoint

@@ -75,12 +75,12 @@ def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_p
     ):
         assert_one_line_error(capsys, [*args, *name, *sensor], message)
     (tmp_path / "data" / "splits.json").unlink()
-    message = "--evaluate-every: got 4, expected a split to evaluate on"
+    message = "--evaluate-every: got 4, expected frames to evaluate on"
     assert_one_line_error(capsys, [*args, "--evaluate-every", "4"], message)
     assert not (tmp_path / "out").exists()
 
 
-def test_an_index_is_refused_where_it_would_be_ignored(tmp_path, capsys):
+def test_an_index_is_refused_where_it_would_be_ignored_or_spoil_the_data(tmp_path, capsys):
     more = (
         f"--data-root {make_folder(tmp_path / 'data', train=1, val=1)} --out {tmp_path}/out --index {tmp_path}/i"
     )
@@ -88,6 +88,8 @@ def test_an_index_is_refused_where_it_would_be_ignored(tmp_path, capsys):
     assert_one_line_error(capsys, [*train, *CLASSES], "--index: got .*, expected none: no prepared objects")
     evaluate = f"evaluate {more} --checkpoint quickstart".split()
     assert_one_line_error(capsys, evaluate, "--index: got .*, expected none: only the tables of nuScenes have an")
+    spoilt = f"prepare --data-root {tmp_path}/data --index {tmp_path}/data/clouds".split()
+    assert_one_line_error(capsys, spoilt, "--index: .*clouds: a folder of own data, expected another one")
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 

@@ -67,7 +67,7 @@ def test_a_failed_connection_is_one_line(monkeypatch, options, error, line):
         join_processes(options, {})
 
 
-@pytest.mark.parametrize("place", ["localhost", ":1", "localhost:x"])
+@pytest.mark.parametrize("place", ["localhost", ":1", "localhost:x", "localhost:0", "localhost:65536"])
 def test_a_coordinator_has_a_host_and_a_port(place):
     options = ProcessOptions(coordinator=place, num_processes=1, process_index=0)
     with pytest.raises(ValueError, match=re.escape(f"--coordinator: got {place!r}, expected HOST:PORT")):

@@ -209,10 +209,9 @@ def test_damaged_files_are_named_before_anything_is_detected(root, tmp_path, mon
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            "--results found --class-map nuscenes",
-            "--class-map: got nuscenes, expected none with a folder",
-        ),
+        ("--results found --class-map nuscenes", "--class-map: got nuscenes, expected none with a folder"),
+        ("--results found --sensor tiny", "--sensor: got tiny, expected none with a folder"),
+        ("--results found --full-turn", "--full-turn: got True, expected none with a folder"),
         ("--results found", "found: sample 000001: missing; sample 9: not expected: .* 2 samples of split 'val'$"),
         (
             "--results found/9.txt",
