@@ -121,6 +121,8 @@ def attribute_of(name: str, speed_mps: float) -> str:
 
     >>> attribute_of("bus", 0.1), attribute_of("bicycle", 3.0), attribute_of("barrier", 0.0)
     ('vehicle.stopped', 'cycle.with_rider', '')
+    >>> attribute_of("car", 0.2), attribute_of("car", 0.21), attribute_of("pedestrian", 0.2)
+    ('vehicle.parked', 'vehicle.moving', 'pedestrian.standing')
     """
     return (*CLASS_ATTRIBUTES[name], "", "")[0 if speed_mps > MOVING_MPS else 1]
 

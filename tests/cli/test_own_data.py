@@ -80,6 +80,18 @@ def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_objects_of_changed_frames_without_splits_are_refused(tmp_path, capsys):
+    data = make_folder(tmp_path / "data", train=1, val=0)
+    (data / "splits.json").unlink()
+    command("prepare --data-root", data)
+    np.save(data / "clouds" / "000.npy", np.load(data / "clouds" / "000.npy")[1:])
+    train = (
+        f"train quickstart --data-root {data} --out {tmp_path}/out --steps 1 --copy-paste.targets 2 2 2 --classes"
+    )
+    message = "all_frames: cut from other frames than all frames, or with other options, .* or --full-turn"
+    assert_one_line_error(capsys, [*train.split(), *CLASSES], message)
+
+
 def test_an_index_is_refused_where_it_would_be_ignored_or_spoil_the_data(tmp_path, capsys):
     more = (
         f"--data-root {make_folder(tmp_path / 'data', train=1, val=1)} --out {tmp_path}/out --index {tmp_path}/i"

@@ -32,6 +32,7 @@ SRUN = {
     "SLURM_STEP_TASKS_PER_NODE": "2",
 }
 BY_HAND = ProcessOptions(coordinator="10.0.0.1:12345", num_processes=2, process_index=1)
+BY_ADDRESS = ProcessOptions(coordinator="[::1]:65535", num_processes=1, process_index=0)
 BY_LAUNCHER = ProcessOptions(distributed=True)
 
 
@@ -40,6 +41,7 @@ BY_LAUNCHER = ProcessOptions(distributed=True)
     [
         (BY_LAUNCHER, {"SLURM_STEP_TASKS_PER_NODE": "1(x2)"}, (None, None, None), ()),
         (BY_HAND, {}, ("10.0.0.1:12345", 2, 1), None),
+        (BY_ADDRESS, {}, ("[::1]:65535", 1, 0), None),
     ],
 )
 def test_passes_the_process_and_its_gpus_to_jax(options, variables, place, ids, monkeypatch):

@@ -108,6 +108,7 @@ BAD_SWEEPS = {
     "NaN": ([entry(sensor_to_world=[[np.nan, 0, 0, 0], *EYE[1:]])], "[0].sensor_to_world[0][0]: got nan, exp"),
     "last row": ([entry(sensor_to_world=[*EYE[:3], [1, 1, 1, 1]])], "$[0].sensor_to_world: got [[1.0, 0.0, 0."),
     "mirrored": ([entry(sensor_to_world=np.diag([-1, 1, 1, 1.0]).tolist())], "expected a rotation in the upper"),
+    "scaled": ([entry(sensor_to_world=np.diag([2, 2, 2, 1.0]).tolist())], "expected a rotation in the upper"),
     "oldest first": ([entry(timestamp_us=t) for t in (9, 1, 8)], "$[2].timestamp_us: got 8, expected less than 1"),
     "twice": ([entry(timestamp_us=9), *2 * [entry(timestamp_us=1)]], "$[2].timestamp_us: got 1, expected less"),
     "nanoseconds": ([entry(timestamp_us=50 * 10**6 + 1), entry()], "timestamp_us: got 5e+07 on average, exp"),

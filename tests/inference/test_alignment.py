@@ -86,6 +86,7 @@ NOT_ROTATED = (
         (align(TINY, paths=FILES, yaw_rad=0.0), ""),
         (align(VLP16, paths=FILES), ""),
         (align(NUSCENES_HDL32E, paths=[Path("LIDAR_TOP/a.pcd.bin")]), ""),
+        (align(NUSCENES_HDL32E, paths=[Path("n015__LIDAR_TOP__7.pcd.bin")]), ""),
         (align(TINY, UNKNOWN), NOT_ROTATED.format("their sensor", ": the detector expects y ahead")),
         (Alignment(TINY, UNKNOWN), NOT_ROTATED.format("the detector's sensor", "")),
         (Alignment(UNKNOWN, TINY, yaw_rad=0.0), ""),

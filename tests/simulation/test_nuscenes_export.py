@@ -1,6 +1,7 @@
 """Check synthetic data sets: official layout, exact annotations, and identical bytes after interruptions."""
 
 import dataclasses
+import errno
 import json
 from pathlib import Path
 
@@ -17,6 +18,24 @@ from fcos_lidar_jax.sensors import TINY, sensor_to_json
 
 VERSION = "v1.0-synthetic"
 ORDER = ["--scenes", "2", "--keyframes", "2", "--sensor", "tiny", "--seed", "4"]
+
+KEYS = {  # of the official tables
+    "attribute": "token name description",
+    "calibrated_sensor": "token sensor_token translation rotation camera_intrinsic",
+    "category": "token name description index",
+    "ego_pose": "token timestamp rotation translation",
+    "instance": "token category_token nbr_annotations first_annotation_token last_annotation_token",
+    "log": "token logfile vehicle date_captured location",
+    "map": "token log_tokens category filename",
+    "sample": "token timestamp prev next scene_token",
+    "sample_annotation": "token sample_token instance_token visibility_token attribute_tokens translation size "
+    "rotation prev next num_lidar_pts num_radar_pts",
+    "sample_data": "token sample_token ego_pose_token calibrated_sensor_token timestamp fileformat is_key_frame "
+    "height width filename prev next",
+    "scene": "token log_token nbr_samples first_sample_token last_sample_token name description",
+    "sensor": "token channel modality",
+    "visibility": "token level description",
+}
 
 
 def command(out: Path, *more: str) -> list[str]:
@@ -39,6 +58,8 @@ def made(tmp_path_factory) -> Path:
 
 def test_the_layout_is_official(made):
     found = tables(made)
+    keys = {name: {" ".join(sorted(row)) for row in rows} for name, rows in found.items() if name != "splits"}
+    assert keys == {name: {" ".join(sorted(of.split()))} for name, of in KEYS.items()}
     train, val = ["scene-0001"], ["scene-0002"]
     assert found["splits"] == {"train": train, "synthetic_train": train, "val": val, "synthetic_val": val}
     for row in found["sample_data"]:
@@ -49,6 +70,23 @@ def test_the_layout_is_official(made):
     np.testing.assert_array_equal(np.diff(stamps), 50_000)
     assert [row["is_key_frame"] for row in found["sample_data"][:11]] == [i % 10 == 0 for i in range(11)]
     assert (made / found["map"][0]["filename"]).is_file()
+
+
+def test_a_sweep_that_was_cut_by_a_full_disk_is_made_again(made, tmp_path, monkeypatch):
+    write, sizes = Path.write_bytes, []
+
+    def until_full(file: Path, data: bytes) -> int:
+        sizes.append(len(data))
+        if len(sizes) < 15:
+            return write(file, data)
+        write(file, data[:-20])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", until_full)
+        assert cli.main(command(tmp_path / "data")) == 1
+    assert len(sizes) == 15
+    assert contents(synthesize(tmp_path / "data")) == contents(made)
 
 
 def test_tokens_and_chains_refer_to_existing_rows(made):
