@@ -118,10 +118,10 @@ COMPACT = dataclasses.replace(
 )
 """One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with a fifth of its parameters.
 
-Layers at stride 1 cost most, so they are narrower than the later ones (``experiments/LOG.md``, 2026-11-22). When
-more training no longer helped, stem, first stage, pyramid and heads were widened, and the first stage got a third
-block (2026-11-27). Doubled rows contain the same points. The image wraps around, so there is no seam behind the
-vehicle. NMS at 0.1, weighted NMS, the IoU exponent, the regression axes and the second look are not in the paper;
+Layers at stride 1 cost most, so they are narrower than the later ones. When more training no longer helped, stem,
+first stage, pyramid and heads were widened, and the first stage got a third block (``experiments/LOG.md``,
+2026-11-27). Doubled rows contain the same points. The image wraps around, so there is no seam behind the vehicle.
+NMS at 0.1, weighted NMS, the IoU exponent, the regression axes and the second look are not in the paper;
 ``experiments/LOG.md`` has what each adds.
 """
 
