@@ -120,7 +120,7 @@ def augment(
             (flip_x, keys[0], config.flip_x_probability),
             (flip_y, keys[1], config.flip_y_probability),
         ):
-            apply = jax.random.bernoulli(flip_key, probability)
+            apply = jax.random.bernoulli(flip_key, float(probability))
             flipped = flip(points, boxes)
             points, boxes = (jnp.where(apply, a, b) for a, b in zip(flipped, (points, boxes), strict=True))
         limit = config.max_rotation_rad

@@ -324,6 +324,11 @@ class Config(Checked):
         return CloudReading(self.num_sweeps, self.projection.remove_close, self.projection.close_m)
 
     @property
+    def trains_second_look_only(self) -> bool:
+        """Whether a training leaves the detector as it is."""
+        return self.refinement is not None and self.refinement.freeze_detector
+
+    @property
     def ranges_m(self) -> dict[str, float]:
         """Class -> evaluation range, metres."""
         given = self.class_ranges_m or [RANGES_M.get(name, DEFAULT_RANGE_M) for name in self.classes]

@@ -19,6 +19,7 @@ from fcos_lidar_jax.types import check_rows
 
 _Members = Callable[[Array, Array, tuple[Array, ...]], tuple[Array, Array]]
 _BLOCK = 512  # Boxes that are compared with a kept box at once; blocks without valid boxes are skipped.
+_ROUNDING = 1e-5  # Overlaps that are not told from zero.
 _MAX_TURN_RAD = np.pi / 3  # Merged boxes must agree on the heading within this angle.
 
 
@@ -213,9 +214,12 @@ def _merged_by_matrix(
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
-    """IoU > threshold, computed without a division; False where the union is zero."""
+    """IoU > threshold, computed without a division; False where the union is zero.
+
+    The intersection of distant boxes is zero only up to rounding, about 1e-7 of the union.
+    """
     intersection, union = oriented_overlap(a, b, vertical=vertical)
-    return intersection > threshold * union
+    return intersection > max(threshold, _ROUNDING) * union
 
 
 def _in_blocks(*arrays: Array) -> list[Array]:

@@ -107,6 +107,16 @@ def test_equal_iou_is_not_above_the_threshold(form):
 
 
 @FORMS
+def test_distant_boxes_do_not_overlap_by_rounding(form):
+    rng = np.random.default_rng(0)
+    boxes = np.zeros((64, 7), np.float32)
+    boxes[:, :2] = 12.0 * np.stack(np.meshgrid(np.arange(8), np.arange(8)), -1).reshape(-1, 2)
+    boxes[:, 3:] = rng.uniform((3, 1, 1, -3), (6, 3, 3, 3), (64, 4))
+    given = boxes, np.ones(64, np.float32), np.ones(64, bool), np.zeros(64, np.int32)
+    assert len(keep(*given, iou_threshold=0.0, max_outputs=64, form=form)) == 64
+
+
+@FORMS
 def test_without_valid_boxes_and_with_boxes_of_zero_size(form):
     assert keep_few(form, np.zeros((5, 7)), np.linspace(1, 0, 5), False) == []
     assert keep_few(form, np.zeros((5, 7)), np.linspace(1, 0, 5)) == [0, 1, 2, 3, 4]

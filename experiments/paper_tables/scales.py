@@ -156,7 +156,7 @@ class Simulated:
         if self.evaluations:
             first = SelectedFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
             options |= {"tests": first, "schedule": Schedule(-(-steps // 20), -(-steps // self.evaluations))}
-        look = config.refinement if config.refinement is not None and config.refinement.freeze_detector else None
+        look = config.refinement if config.trains_second_look_only else None
         first = config if look is None else dataclasses.replace(config, refinement=None)
         detector = trained(folder, first, frames, steps=steps, seed=seed, objects=objects, **options)
         if look is not None:

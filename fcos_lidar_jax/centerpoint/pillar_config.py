@@ -18,7 +18,7 @@ class PillarConfig(Checked):
     range_m: Positive = 51.2  # Half the side of the square of pillars around the sensor, metres.
     pillar_m: Positive = 0.2  # Side of a pillar, metres.
     point_channels: Annotated[tuple[int, ...], Bounds(2)] = (64, 64)  # Channels of the layers on each point.
-    backbone_blocks: tuple[int, int, int] = (3, 5, 5)
+    backbone_blocks: Annotated[tuple[int, int, int], Bounds(0)] = (3, 5, 5)
     """3x3 convolutions per stage after the first, which halves the resolution."""
     backbone_widths: Annotated[tuple[int, int, int], Bounds(1)] = (64, 128, 256)  # Channels per stage.
     neck_channels: Count = 128  # Channels from each stage to the heads.

@@ -75,7 +75,7 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
         code = _CLOSED_PIPE
     except SystemExit as stop:
         code, stopped = 0, stop
-    failures = [_flush(stream) for stream in (sys.stdout, sys.stderr)]
+    failures = [stream and _flush(stream) for stream in (sys.stdout, sys.stderr)]
     if any(isinstance(failure, BrokenPipeError) for failure in failures):
         return _CLOSED_PIPE
     if (failure := failures[0]) is not None and not code and (stopped is None or not stopped.code):
@@ -153,7 +153,7 @@ def _is_unread(stream: TextIO) -> bool:
     """Whether an output is a pipe whose other end is closed."""
     try:
         (poll := select.poll()).register(stream.fileno(), 0)
-    except (OSError, ValueError):  # not a file
+    except (AttributeError, OSError, ValueError):  # none, or not a file
         return False
     return any(event & select.POLLERR for _, event in poll.poll(0))
 

@@ -20,6 +20,7 @@ class Output(enum.Enum):
     """The option is a path to write to."""
 
     FILE = "file"
+    CLOUD = "cloud"  # a file that may replace a point file
     FOLDER = "folder"
     RESULT = "result"  # a file, or a folder for --output-format kitti
 
@@ -131,7 +132,7 @@ def _check_outputs(options: dict[str, _Option]) -> None:
                 check_writable(out / ".lock")
             else:
                 check_out_file(option_name(name), out, keep)
-                if is_result and out.is_file() and out.name.lower().endswith(ENDINGS):
+                if option.output is not Output.CLOUD and out.is_file() and out.name.lower().endswith(ENDINGS):
                     raise ValueError(f"{option_name(name)}: {out}: found a point file, expected another one")
             keep.append(out)
 

@@ -145,7 +145,7 @@ def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]
     for part in text.split(","):
         ends = re.fullmatch(r"\s*(\d+)\s*:\s*(\d+)\s*", part)
         new = range(int(ends[1]), int(ends[2])) if ends else range(0)
-        fits = len(new) > 0 and new.stop <= number and not set(new) & set(indices)
+        fits = new.stop <= number and len(new) > 0 and not set(new) & set(indices)
         check(fits, option, part, f"FIRST:LAST with FIRST < LAST within the {number} frames, without overlap")
         indices += new
     return indices

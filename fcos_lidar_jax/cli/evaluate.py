@@ -39,7 +39,8 @@ from fcos_lidar_jax.visualization.evaluation_report import PAGE
 _TOO_HIGH = "scores on training frames are too high"
 _NO_DETECTION = Excludes(("backend", "batch_size", "yaw_deg", "distributed", "coordinator"), "nothing is detected")
 _NO_DATA = Excludes(
-    ("checkpoint", "data_root", "format", "class_map", "split", "samples"), "it takes the place of a data set"
+    ("checkpoint", "split", "samples", *(field.name for field in dataclasses.fields(DataOptions))),
+    "it takes the place of a data set",
 )
 _ONE_PROCESS = Excludes(("distributed", "coordinator"), "only xla runs in several processes")
 _WRITTEN = ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY)

@@ -30,8 +30,9 @@ class Prepare:
     """Prepare a data set for training: extract objects for copy-paste from the training split and, for nuScenes,
     index the tables.
 
-    Objects and index are verified whenever they are opened, and can be rebuilt at any time. After Ctrl-C or a
-    kill, the same command resumes and repeats at most one scene of objects.
+    Objects and index are verified whenever they are opened, and can be rebuilt. A training that runs meanwhile
+    stops if its objects change, and resumes after they are prepared as before. After Ctrl-C or a kill, the same
+    command resumes and repeats at most one scene of objects.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.

@@ -31,7 +31,7 @@ class Project:
     """
 
     file: tyro.conf.Positional[Annotated[Path, option("FILE", text=f"Point file: {', '.join(ENDINGS)}.")]]
-    out: Annotated[Path, Output.FILE, option("FILE.npz")]  # File for the range image.
+    out: Annotated[Path, Output.CLOUD, option("FILE.npz")]  # File for the range image.
     png: Annotated[Path | None, Output.FILE, option("FILE.png")] = None
     """Also draw the range image, one panel per round."""
     sensor: options.Sensor = "nuscenes_hdl32e"

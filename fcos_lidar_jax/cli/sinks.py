@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.cli.checks import check_out_file
 from fcos_lidar_jax.data.kitti import TO_NUSCENES, read_calibration
 from fcos_lidar_jax.data.point_files import ENDINGS
 from fcos_lidar_jax.evaluation.json_io import write_lines
@@ -52,7 +53,9 @@ def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Seq
         if len(set(stems)) < len(stems):
             raise ValueError(f"{option}: got clouds of the same name, expected different names")
         for cloud, stem in zip(clouds, stems, strict=True):
-            read_calibration(_calibration(args.calibration, cloud, stem))
+            calibration = _calibration(args.calibration, cloud, stem)
+            read_calibration(calibration)
+            check_out_file("--out", args.out / f"{stem}.txt", [calibration])
         for file in sorted(args.out.glob("*.txt")):
             if any(len(line.split()) == _LABEL_COLUMNS for line in file.read_text(errors="replace").splitlines()):
                 raise ValueError(f"--out: {file}: found labels, which have no score, expected results or nothing")

@@ -92,7 +92,7 @@ class Argoverse2Frames(FrameSet):
 
     def labels(self, index: int) -> np.ndarray:
         _, labels, num_points = self._boxes(index)
-        return labels[num_points > 0]
+        return labels[num_points != 0]
 
     def name(self, index: int) -> str:
         """The log's name and the sweep's time in nanoseconds."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.data.sweeps import Sweep, check_poses, read_entries
+from fcos_lidar_jax.data.sweeps import Sweep, check_gaps, check_poses, read_entries
 from fcos_lidar_jax.data.text_files import read_lines, read_number
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.progress import tell
@@ -160,6 +160,7 @@ def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list
             raise ValueError(f"{poses}: no pose of {file}, expected an entry for every cloud")
     ordered = [(clouds[place], entry) for place, entry in entries.items() if place in clouds]
     times = [entry.timestamp_us for _, entry in ordered]
+    check_gaps(poses, times)
     return [file for file, _ in ordered], times, [np.array(entry.sensor_to_world) for _, entry in ordered]
 
 
@@ -207,7 +208,7 @@ def _time_of(file: Path) -> int | None:
     if not (whole.isdecimal() and (part or "0").isdecimal()):
         return None
     if point:
-        return round(Decimal(stem) * 1_000_000) if float(stem) < _LATEST_S else None
+        return int(Decimal(stem) * 1_000_000) if float(stem) < _LATEST_S else None
     return int(stem) // 1000 if len(stem) in _NANOSECOND_DIGITS else None
 
 
@@ -221,7 +222,7 @@ def read_tum(path: Path) -> PoseTrack:
             raise ValueError(f"{where}: got {' '.join(words)[:80]!r}, expected t x y z qx qy qz qw")
         _, x, y, z, *vector, scalar = (read_number(word, where, largest=_LATEST_S) for word in words)
         places.append(where)
-        times.append(round(Decimal(words[0]) * 1_000_000))  # a float cannot represent today's microseconds
+        times.append(int(Decimal(words[0]) * 1_000_000))  # a float cannot represent today's microseconds
         rows.append((scalar, *vector, x, y, z))
     if not rows:
         raise ValueError(f"{path}: no pose in it, expected lines t x y z qx qy qz qw")

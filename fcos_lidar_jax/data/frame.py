@@ -25,7 +25,7 @@ class Frame:
             as a sixth column for sensors whose rows come from it.
         boxes: f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN velocity where unknown.
         labels: i32[m]: index into the ``classes`` of the frame set.
-        num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box.
+        num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box, -1 if unknown.
         num_close: number of points on the ego vehicle that the reader removed, see :func:`drop_close`.
     """
 
@@ -66,7 +66,8 @@ class FrameSet(Protocol):
 
     def labels(self, index: int) -> np.ndarray:
         """i32[m]: labels of the frame's boxes, except boxes known to be empty; avoids reading the points."""
-        return self.truth(index).labels
+        truth = self.truth(index)
+        return truth.labels[truth.num_points != 0]
 
     def name(self, index: int) -> str:
         """Unique name of a frame in messages and results files."""

@@ -20,9 +20,9 @@ from fcos_lidar_jax.types import Detections
 def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric: Metric) -> Evaluation:
     """Evaluate detections against the boxes of their frames with the mAP by centre distance.
 
-    This is not the nuScenes benchmark: ranges are measured from the sensor instead of the ego vehicle, only LiDAR
-    points decide whether a box is evaluated, there are no bicycle racks, attributes or NDS, and means are over the
-    classes that occur in the truth.
+    This is not the nuScenes benchmark: ranges are measured from the origin of the points instead of the ego
+    vehicle, only LiDAR points decide whether a box is evaluated, there are no bicycle racks, attributes or NDS,
+    and means are over the classes that occur in the truth.
 
     Args:
         found: NumPy detections per frame, with labels by the metric's classes.

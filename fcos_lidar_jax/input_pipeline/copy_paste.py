@@ -50,7 +50,7 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
     pools = [np.flatnonzero(usable & (labels == label)) for label in range(len(targets))]
 
     def paste(frame: Frame, rng: np.random.Generator) -> tuple[Frame, np.ndarray]:
-        present = np.bincount(frame.labels[frame.num_points >= 1], minlength=len(pools))
+        present = np.bincount(frame.labels[frame.num_points != 0], minlength=len(pools))
         missing = np.maximum(np.array(targets) - present, 0)
         sampled = [
             rng.choice(pool, min(count, len(pool)), replace=False)

@@ -97,7 +97,7 @@ class _BatchOf:
         index, num_pasted = self.order[position], 0
         frame = self.frames.frame(index)
         check_boxes(frame.boxes, lambda box: f"frame {self.frames.name(index)!r}: box {box}")
-        seen = frame.num_points >= 1
+        seen = frame.num_points != 0
         boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
         parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)
         if self.paste is not None and step < self.fade_step:

@@ -177,8 +177,9 @@ def default_split(
     other purpose. If there are several others, an error asks for a choice. Returns None if the data have no
     splits, or if that split is missing and not required. ``splits`` is a file of custom splits.
     """
-    name = f"mini_{purpose}" if data.version.endswith("mini") else purpose
-    names = data.reader.splits(data, splits)
+    names, name = data.reader.splits(data, splits), purpose
+    if data.version.endswith("mini") and f"mini_{purpose}" in names:
+        name = f"mini_{purpose}"
     if name in names:
         return name
     if not required or not names:

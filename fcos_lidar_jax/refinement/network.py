@@ -39,7 +39,8 @@ def box_features(
     *,
     with_velocity: bool = False,
 ) -> Float32[Array, "m f"]:
-    """Features of the boxes: class, logit of the score, log sizes, range, number of points, turn from the ray.
+    """Features of boxes around a sensor: class, logit of the score, log sizes, range, number of points, turn from
+    the ray.
 
     With ``with_velocity`` (static) also the velocity along the heading and to the left.
     """

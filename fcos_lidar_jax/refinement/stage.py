@@ -19,6 +19,7 @@ from fcos_lidar_jax.refinement.crops import crop_points
 from fcos_lidar_jax.refinement.network import SecondLook, box_features, find_neighbours, point_features
 from fcos_lidar_jax.refinement.targets import match_boxes, move_boxes
 from fcos_lidar_jax.refinement.types import LookInputs, RefinementTargets
+from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Batch, Sums
 
 if TYPE_CHECKING:
@@ -46,7 +47,8 @@ def add_refinement(detector: "Detector") -> "Detector":
     network = make_network(config)
 
     def init(key: Any) -> dict[str, Any]:
-        variables, look = detector.init(key), init_variables(network, jax.random.fold_in(key, 1), _shapes(config))
+        variables = detector.init(key)
+        look = init_variables(network, jax.random.fold_in(key, 1), _shapes(detector))
         return variables | {"params": variables["params"] | {SECOND_LOOK: look["params"]}}
 
     def apply(variables: Any, inputs: Any, *, train: bool = False) -> tuple[Any, Any]:
@@ -62,7 +64,7 @@ def add_refinement(detector: "Detector") -> "Detector":
         (losses, counts, means), own = of_boxes, of_detector
         return Sums(own.losses | losses, own.counts | counts, own.means | means)
 
-    refine = functools.partial(refine_boxes, network, config)
+    refine = functools.partial(refine_boxes, network, config, detector.sensor)
     return detector._replace(init=init, apply=apply, sums=sums, refine=refine)
 
 
@@ -87,8 +89,7 @@ def _sees_motion(config: Config) -> bool:
 
 def trainable(params: dict[str, Any], config: Config) -> dict[str, Any]:
     """The part of the parameters that a training changes: all, or those of the second look only."""
-    frozen = config.refinement is not None and config.refinement.freeze_detector
-    return {SECOND_LOOK: params[SECOND_LOOK]} if frozen else params
+    return {SECOND_LOOK: params[SECOND_LOOK]} if config.trains_second_look_only else params
 
 
 def proposal_inference(config: Config) -> InferenceConfig:
@@ -114,13 +115,14 @@ def best_boxes(boxes: Boxes, number: int) -> Boxes:
     return cut[0], cut[1], cut[2], cut[3]
 
 
-def look_inputs(config: Config, points: Array, valid: Array, boxes: Boxes) -> LookInputs:
-    """Features of points, boxes and neighbours of one cloud."""
+def look_inputs(config: Config, sensor: Sensor, points: Array, valid: Array, boxes: Boxes) -> LookInputs:
+    """Features of points, boxes and neighbours of one cloud; ranges and rays begin at the sensor."""
     refinement = _config_of(config)
     place, scores, labels, used = boxes
     crops = crop_points(points, valid, place, num_points=refinement.num_points, margin_m=refinement.margin_m)
+    seen = place.at[:, :3].add(-jnp.array(sensor.origin_m, jnp.float32))
     of_boxes = box_features(
-        place, scores, labels, crops.count, len(config.classes), with_velocity=_sees_motion(config)
+        seen, scores, labels, crops.count, len(config.classes), with_velocity=_sees_motion(config)
     )
     number = refinement.num_neighbours
     neighbours = find_neighbours(place, scores, labels, used, number) if number else None
@@ -134,7 +136,13 @@ def look(network: SecondLook, variables: Any, inputs: LookInputs) -> tuple[Array
 
 
 def refine_boxes(
-    network: SecondLook, config: Config, variables: Any, points: Array, valid: Array, *boxes: Array
+    network: SecondLook,
+    config: Config,
+    sensor: Sensor,
+    variables: Any,
+    points: Array,
+    valid: Array,
+    *boxes: Array,
 ) -> Boxes:
     """Score the best boxes of one cloud anew, and move them; boxes beyond ``num_boxes`` are dropped.
 
@@ -149,7 +157,7 @@ def refine_boxes(
     refinement = _config_of(config)
     place, scores, labels, used = best_boxes((boxes[0], boxes[1], boxes[2], boxes[3]), refinement.num_boxes)
     with jax.named_scope("refine"):
-        looked = look_inputs(config, points, valid, (place, scores, labels, used))
+        looked = look_inputs(config, sensor, points, valid, (place, scores, labels, used))
         logits, residual = look(network, variables, looked)
         probability = jnp.take_along_axis(jax.nn.softmax(logits), labels[:, None], axis=1)[:, 0]
         share = refinement.first_score_weight
@@ -191,7 +199,7 @@ def look_samples(
             between_weight=refinement.between_weight,
             with_velocity=_sees_motion(config),
         )
-        return look_inputs(config, one.points, one.valid, boxes), targets
+        return look_inputs(config, detector.sensor, one.points, one.valid, boxes), targets
 
     return over_samples(prepared, lax.stop_gradient((outputs, inputs, batch)))
 
@@ -234,7 +242,8 @@ def _config_of(config: Config) -> RefinementConfig:
     return config.refinement
 
 
-def _shapes(config: Config) -> Any:
+def _shapes(detector: "Detector") -> Any:
     """Shapes of the network's inputs for one box of a cloud of one point."""
     boxes = jnp.zeros((1, 9)), jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.zeros(1, bool)
-    return jax.eval_shape(lambda: look_inputs(config, jnp.zeros((1, 5)), jnp.zeros(1, bool), boxes))
+    cloud = detector.config, detector.sensor, jnp.zeros((1, 5)), jnp.zeros(1, bool)
+    return jax.eval_shape(lambda: look_inputs(*cloud, boxes))

@@ -154,7 +154,7 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
         _check_pasting(spec, -(-order.epoch_size // config.optimizer.batch_size))
     if config.augment is not None:
         check_augmentation(config.augment, frames.sensor)
-    if config.refinement is not None and config.refinement.freeze_detector:
+    if config.trains_second_look_only:
         check(spec.weights is not None, "refinement.freeze_detector", True, "False without weights of a detector")
     detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, spec.steps)
     jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(spec.seed))
@@ -254,8 +254,11 @@ def _initial_weights(
     folder = find_checkpoint(Path(weights))
     checkpoint = read_checkpoint(folder)
     classes = checkpoint.config.classes
+    same, frozen = classes == detector.config.classes, detector.config.trains_second_look_only
+    expected = f"False, or the classes of {folder}: {', '.join(classes)}"  # other classes need random layers
+    check(same or not frozen, "refinement.freeze_detector", frozen, expected)
     variables = _with_second_look(folder, checkpoint.variables, detector, classes, seed)
-    if classes != detector.config.classes:
+    if not same:
         variables = _for_other_classes(folder, classes, variables, detector, seed)
     check_arrays(folder, shapes, variables, whose=whose)
     own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))

@@ -23,7 +23,8 @@ def rerun_recording(
     """Yield a function that records frames, with the arguments of :func:`~.page.page_frame`.
 
     Frames are written immediately. The file appears when the context ends without an error. Boxes below
-    ``min_score`` are not recorded, because the viewer cannot hide them.
+    ``min_score`` are not recorded, because the viewer cannot hide them. Positions are relative to the first pose,
+    because the viewer's float32 would round world coordinates to decimetres.
     """
     import rerun as rr  # pyright: ignore[reportMissingImports]
 
@@ -31,13 +32,14 @@ def rerun_recording(
         recording = rr.RecordingStream("fcos_lidar_jax")
         recording.save(temporary)
         with recording:
-            yield functools.partial(_record, recording, itertools.count(), classes, min_score)
+            yield functools.partial(_record, recording, itertools.count(), [], classes, min_score)
         recording.disconnect()
 
 
 def _record(
     recording: Any,
     number: Iterator[int],
+    origin: list[np.ndarray],
     classes: Sequence[str],
     min_score: float,
     points: np.ndarray,
@@ -57,7 +59,8 @@ def _record(
     if time_us is not None:
         recording.set_time("time", timestamp=np.datetime64(time_us, "us"))
     if pose is not None:
-        recording.log("sensor", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        origin[:] = origin or [pose[:3, 3]]
+        recording.log("sensor", rr.Transform3D(translation=pose[:3, 3] - origin[0], mat3x3=pose[:3, :3]))
     points = points[np.isfinite(points[:, :3]).all(axis=1)]
     height = points[:, 2] - (np.quantile(points[:, 2], 0.1) if len(points) else 0)
     colors = mpl.colormaps["viridis"](height / _HIGH_M, bytes=True)

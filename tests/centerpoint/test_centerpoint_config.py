@@ -23,6 +23,7 @@ from fcos_lidar_jax.presets import CENTERPOINT_PILLARS, COMPACT, NUSCENES
         lambda: PillarConfig(pillar_m=0.0),
         lambda: PillarConfig(output_stride=3),  # type: ignore[arg-type]
         lambda: PillarConfig(point_channels=()),
+        lambda: PillarConfig(backbone_blocks=(-1, 5, 5)),
         lambda: PillarConfig(groups=(0, 2)),
         lambda: PillarConfig(min_overlap=1.0),
         lambda: CenterPointConfig(pillars=PillarConfig(groups=(0, 1))),

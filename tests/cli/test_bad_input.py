@@ -33,6 +33,8 @@ def home(tmp_path_factory):
     (folder / "link.json").symlink_to("good.npy")
     (folder / "a.bag").touch()
     (folder / "calibration.txt").write_text(calibration_text())
+    (folder / "training" / "calib").mkdir()
+    (folder / "training" / "calib" / "0.txt").write_text(calibration_text())
     (folder / "labels").mkdir()
     (folder / "labels" / "0.txt").write_text("Car 0.00 0 0.1 10 20 30 40 1.5 1.6 3.9 1 2 9 0.2\n")
     entry = {"sensor_to_world": np.eye(4).tolist()}
@@ -69,6 +71,8 @@ detect HOME/good.npy --output-format nuscenes => --output-format nuscenes: found
 detect HOME/good.npy --out HOME/good.npy => --out: .*the same file as .*good.npy
 detect HOME/good.npy --out OUT --page OUT => --page: .*the same file as .*out
 detect HOME/training/velodyne --out HOME/training/velodyne/0.npy => --out: .*found a point file
+detect HOME/good.npy --out OUT --page HOME/training/velodyne/0.npy => --page: .*found a point file
+detect HOME/training/velodyne/0.npy --output-format kitti --out HOME/training/calib => --out: .*the same file as
 detect HOME/good.npy gs://b/run => gs://b/run: got a URL, expected a path: copy
 detect HOME/none.npy --out HOME/link.json => link.json: found a link to .*good
 detect HOME/none.npy --out HOME/good.npy/x => good.npy: found a file, expected a fol
@@ -87,6 +91,7 @@ stream --data-root HOME/data --scene scene-0 --output-format nuscenes => expecte
 evaluate => --checkpoint: got none, expected one, or --results$
 evaluate --results HOME/truth.json => data root: missing, expected the folder of a data set
 evaluate --checkpoint x --ground-truth HOME/truth.json => --ground-truth: .* expected none with --checkpoint
+evaluate --results x --ground-truth HOME/truth.json --version v1 => --ground-truth: .* none with --version
 evaluate --results x --ground-truth HOME/truth.json --batch-size 2 => --results: .* none with --batch-size
 evaluate --results x --ground-truth HOME/truth/results_nusc.json --out HOME/truth => --out: .*: the same file as
 evaluate --results x --ground-truth HOME/truth/curves.json --out HOME/truth => --out: .*: the same file as

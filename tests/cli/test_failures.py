@@ -213,6 +213,14 @@ def test_an_output_on_a_full_disk_is_one_line(tmp_path, work):
     assert (done.returncode, done.stderr) == (1, line)
 
 
+@pytest.mark.parametrize("closed", [("stdout",), ("stderr",), ("stdout", "stderr")])
+def test_closed_outputs_are_left_out(monkeypatch, closed):
+    for name in closed:  # Python gives a process without a descriptor None
+        monkeypatch.setattr(sys, name, None)
+    assert exit_code("program", lambda: print("text")) == 0
+    assert exit_code("program", fail_with(ValueError("text"))) == 1
+
+
 URL_HINT = "got a URL, expected a path: copy the files (gsutil, aws s3) or mount the bucket (gcsfuse)"
 
 

@@ -166,6 +166,7 @@ BAD = mistakes(r"""
 --val-split other => split 'other': not found
 --samples 1 => --samples: got '1', expected FIRST:LAST with FIRST < LAST within the 6 frames, without overlap$
 --samples 0:2,1:2 => --samples: got '1:2', expected
+--samples 0:99999999999999999999 => --samples: got '0:99999999999999999999', expected
 --val-samples 2:2 => --val-samples: got '2:2', expected
 --val-split none --evaluate-every 4 => --evaluate-every: got 4, expected frames to evaluate on
 --val-split none --val-samples 0:1 => --val-samples: got '0:1', expected frames to evaluate on

@@ -56,6 +56,12 @@ def test_clouds_named_by_times_are_in_temporal_order(poses):
     np.testing.assert_allclose([sweep.sensor_to_world[0, 3] for sweep in sweeps], [0, 1, 2, 3], atol=1e-12)
 
 
+def test_equal_times_in_seconds_and_nanoseconds_match(poses):
+    (poses / "poses.txt").write_text("1700000000.123456789 4 0 0 0 0 0 1\n")
+    [sweep] = drive_of(poses, "1700000000123456789").sweeps
+    assert (sweep.time_us, sweep.sensor_to_world[0, 3]) == (1_700_000_000_123_456, 4)
+
+
 @pytest.mark.parametrize(
     ("numbers", "places_m", "step_s", "told"),
     [
@@ -96,18 +102,19 @@ def test_names_that_are_not_sorted_by_their_numbers_are_refused(poses):
 
 
 @pytest.mark.parametrize(
-    ("names", "message"),
+    ("names", "clouds", "message"),
     [
-        (("a", "a"), "poses.json: got 2 entries for 1 clouds, expected each once"),
-        (("b",), "poses.json: no pose of"),
+        ("aa", "a", "poses.json: got 2 entries for 1 clouds, expected each once"),
+        ("b", "a", "poses.json: no pose of"),
+        ("ab", "ab", "poses.json: timestamp_us: got 1e+08 (median), expected microseconds"),
     ],
 )
-def test_a_list_needs_every_cloud_once(poses, names, message):
-    entry = {"sensor_to_world": np.eye(4).tolist(), "timestamp_us": 0}
-    listed = [{"file": f"clouds/{name}.npy", **entry} for name in names]
+def test_a_list_needs_every_cloud_once_with_its_time(poses, names, clouds, message):
+    pose = {"sensor_to_world": np.eye(4).tolist()}
+    listed = [{"file": f"clouds/{name}.npy", "timestamp_us": i * 10**8, **pose} for i, name in enumerate(names)]
     (poses / "poses.json").write_text(json.dumps(listed))
     with refused(message):
-        drive_of(poses, "a", poses="poses.json")
+        drive_of(poses, *clouds, poses="poses.json")
 
 
 @pytest.mark.parametrize(

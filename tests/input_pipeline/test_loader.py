@@ -133,6 +133,15 @@ def test_a_sample_contains_its_frame_without_empty_boxes():
     assert batch.counts == {"truncated_points": 0, "truncated_boxes": 0, "invalid_points": 0, "pasted_objects": 0}
 
 
+def test_boxes_with_an_unknown_number_of_points_are_learned():
+    frame = toy_frame(0)
+    frame.num_points[:3] = -1, 0, -1
+    frames = ListedFrames((frame,))
+    [batch] = run(frames, count=1)
+    np.testing.assert_array_equal(batch.batch.labels[0][:2], frame.labels[[0, 2]])
+    np.testing.assert_array_equal(frames.labels(0), frame.labels[frame.num_points != 0])
+
+
 def test_pasted_objects_replace_the_points_of_the_frame_in_their_boxes(objects):
     [batch] = run(config=CONFIG, objects=objects, count=1)
     assert batch.counts["pasted_objects"] > 20

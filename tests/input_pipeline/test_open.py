@@ -270,6 +270,7 @@ def test_default_splits(roots, tmp_path):
     assert (split(root, "train"), split(root, "val", required=False)) == ("train", "val")
     (root / VERSION).rename(root / "v1.0-mini")
     assert (split(root, "train"), split(root, "val")) == ("mini_train", "mini_val")
+    assert split(root, "train", splits=tmp_path / "own.json") == "train"
     root = shutil.copytree(roots["kitti"], tmp_path / "kitti")
     shutil.rmtree(root / "ImageSets")
     assert (split(root, "train"), split(root, "val")) == (None, None)

@@ -17,7 +17,7 @@ from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.refinement.network import REACH_M
-from fcos_lidar_jax.refinement.stage import best_boxes, refinement_sums, trainable
+from fcos_lidar_jax.refinement.stage import best_boxes, look_inputs, refinement_sums, trainable
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step, plan
 from fcos_lidar_jax.training.step import make_gradient
 
@@ -215,6 +215,19 @@ def test_only_boxes_nearby_decide_a_score():
         scores[distance, valid] = float(found[1][found[3] & (found[2] == 0)][0])
     assert scores[2 * REACH_M, True] == scores[2.0, False]
     assert len({*scores.values()}) == 3
+
+
+def test_a_sensor_off_the_origin_sees_the_same():
+    batch, shift = host_batch(), np.array([3.0, -2.0, 0.5])
+    found = []
+    for origin in (np.zeros(3), shift):
+        points, boxes = batch.points[0].copy(), batch.boxes[0][:2].copy()
+        points[:, :3] += origin
+        boxes[:, :3] += origin
+        sensor = dataclasses.replace(SENSOR, origin_m=tuple(origin))
+        seen = boxes, np.array([0.9, 0.5]), np.array([0, 1]), np.ones(2, bool)
+        found.append(look_inputs(detector(SMALL)[0].config, sensor, points, batch.valid[0], seen).boxes)
+    np.testing.assert_allclose(*found, atol=1e-5)
 
 
 def test_centerpoint_takes_a_second_look_too():

@@ -121,6 +121,12 @@ def test_initial_weights_of_another_network_or_sensor_are_reported(finished, cap
     assert all(re.search(message, line) for line in lines)
 
 
+def test_a_frozen_detector_keeps_its_classes(finished):
+    frozen = dataclasses.replace(FROZEN, classes=REVERSED.classes)
+    with pytest.raises(ValueError, match=r"freeze_detector: got True, expected False, or the classes of .*: car,"):
+        plan._initial_weights(build_detector(frozen, SENSOR), finished[0])
+
+
 def test_initial_weights_in_half_precision_are_trained_in_float32():
     half = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), weights())
     taken = plan._initial_weights(build_detector(CONFIG, SENSOR), half)

@@ -193,10 +193,10 @@ class NuScenes:
         return Boxes(boxes, labels, index.box_lidar_points[rows], attributes, tokens)
 
     def labels(self, sample_token: str) -> np.ndarray:
-        """i32[m]: labels of a keyframe's boxes with at least one LiDAR point."""
+        """i32[m]: labels of a keyframe's boxes, except boxes known to be empty."""
         own = self.annotations(sample_token)
         labels = self._label[self.index.box_category[own]]
-        return labels[(labels >= 0) & (self.index.box_lidar_points[own] > 0)]
+        return labels[(labels >= 0) & (self.index.box_lidar_points[own] != 0)]
 
     def annotations(self, sample_token: str) -> slice:
         """Rows of a keyframe's annotations of all categories in the index."""
