@@ -93,8 +93,8 @@ class PoseTrack(NamedTuple):
         from scipy.spatial.transform import Rotation, Slerp  # SciPy takes long to import
 
         known_us, rotations, translations = self
-        last = int(np.searchsorted(known_us, time_us))
-        if last < len(known_us) and known_us[last] == time_us:
+        last = int(np.searchsorted(known_us, time_us - 1))
+        if last < len(known_us) and known_us[last] <= time_us + 1:  # programs round times up or down
             return pose_matrix(rotations[last], translations[last])
         outside = not 0 < last < len(known_us)
         if outside or known_us[last] - known_us[last - 1] > MAX_POSE_GAP_US:

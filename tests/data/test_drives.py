@@ -56,8 +56,9 @@ def test_clouds_named_by_times_are_in_temporal_order(poses):
     np.testing.assert_allclose([sweep.sensor_to_world[0, 3] for sweep in sweeps], [0, 1, 2, 3], atol=1e-12)
 
 
-def test_equal_times_in_seconds_and_nanoseconds_match(poses):
-    (poses / "poses.txt").write_text("1700000000.123456789 4 0 0 0 0 0 1\n")
+@pytest.mark.parametrize("digits", ["123455", "123456789", "123457"])
+def test_times_that_differ_by_rounding_match(poses, digits):
+    (poses / "poses.txt").write_text(f"1700000000.{digits} 4 0 0 0 0 0 1\n")
     [sweep] = drive_of(poses, "1700000000123456789").sweeps
     assert (sweep.time_us, sweep.sensor_to_world[0, 3]) == (1_700_000_000_123_456, 4)
 
