@@ -162,6 +162,8 @@ def _check(args: Args) -> None:
     if len({*args.seeds}) < len(args.seeds):
         raise ValueError(f"--seeds: got {args.seeds}, expected different seeds")
     real_cloud(args.data)
+    if args.scale == "nuscenes" and args.simulators:
+        raise ValueError("--simulators: expected none with --scale nuscenes: its frames are real")
     if args.scale != "nuscenes":
         for field in dataclasses.fields(NuScenesLayout):
             if getattr(args.nuscenes, field.name) != field.default:

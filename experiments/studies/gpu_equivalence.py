@@ -104,12 +104,14 @@ def _detect(device: Any, detector: TrainedDetector, clouds: list[Any], precision
 
 
 def _pairs(first: Detections, second: Detections) -> Iterator[tuple[float, float]]:
-    """Distance and difference of scores of each box and the nearest of the same class on the other device."""
+    """Distance and difference of scores of each box and its nearest partner of the same class, used once."""
+    free = second.valid.copy()
     for row in np.flatnonzero(first.valid):
-        same = np.flatnonzero(second.valid & (second.labels == first.labels[row]))
+        same = np.flatnonzero(free & (second.labels == first.labels[row]))
         distance = np.linalg.norm(second.boxes[same, :3] - first.boxes[row, :3], axis=1)
         if len(same) and distance.min() <= _NEAR_M:
             nearest = same[distance.argmin()]
+            free[nearest] = False
             yield float(distance.min()), float(abs(second.scores[nearest] - first.scores[row]))
 
 

@@ -12,8 +12,8 @@ after each quarter of the training. A second look (``refinement``) is trained in
 afterwards on the same frames ("looked at again"), with the first trial's weights frozen and boxes that were found
 once: by 3,000 updates of four frames, or, "for longer" and after "local geometry", by 24,000 of one of 2,000
 frames. The seconds per step of the latter are its whole time without the detector's training, divided by the
-steps. Only "neighbours" and "local geometry, looked at again" compare each box with its neighbours, as ``compact``
-does.
+steps; after an interruption, they lack the time before. Only "neighbours" and "local geometry, looked at again"
+compare each box with its neighbours, as ``compact`` does.
 
 The same command resumes a trial, except for the updates of a second look afterwards. Trials that are already in
 the file of ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the table of the

@@ -179,8 +179,10 @@ def train(args: Args, work: Path) -> dict[str, Any]:
         config = look_config(config, config.refinement, batch_size=args.batch_size)
     if args.learning_rate is not None:
         config = change(optimizer__peak_learning_rate=args.learning_rate)(config)
-    # Rejects before hours of training what the export would reject.
-    earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed})
+    # Rejects before hours of training what the export would reject, or leave out of the record.
+    earlier = earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": None})
+    if not work.exists() and args.seed in (seeds := [training["seed"] for training in earlier]):
+        raise ValueError(f"--seed: got {args.seed}, expected none of the earlier trainings, {seeds}")
     if args.second_look:
         return train_second_look(args, work, config)
     number = _POOL // config.optimizer.batch_size if args.simulators else args.steps

@@ -24,6 +24,7 @@ from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
+from fcos_lidar_jax.inference.stream import shows_nothing_new
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E
 
@@ -90,7 +91,8 @@ def run(args: Detect) -> None:
 
     def entries(found: Prediction) -> tuple[list[dict[str, Any]], str]:
         assert found.cloud is not None
-        min_score = args.min_score if found.note is None else math.inf  # without usable points, no boxes
+        nothing = found.note is not None or (sweeps and shows_nothing_new(found.cloud, detector.sensor))
+        min_score = math.inf if nothing else args.min_score  # without usable points, no boxes
         kept = select(found.detections, classes, min_score=min_score, labels=args.labels)
         record = {"file": str(files[found.index]), **cloud_record(kept, found.cloud, classes)}
         clear = sum(box["score"] >= shown_score for box in record["boxes"])

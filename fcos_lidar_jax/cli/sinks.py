@@ -34,6 +34,7 @@ Add = Callable[[Record, np.ndarray], None]
 
 
 _LABEL_COLUMNS = 15  # Results have a score after them.
+_LARGEST_PAGE = 4e8  # Characters of encoded points; the longest text of browsers has 2**29.
 _TYPES = kitti_types(TO_NUSCENES) | kitti_types()
 
 
@@ -82,7 +83,7 @@ def open_sinks(
     with contextlib.ExitStack() as stack:
         write = stack.enter_context(result)
         if args.page is not None:
-            views.append(lambda *given, **details: frames.append(page_frame(*given, **details)))
+            views.append(_collect(frames))
         if args.rrd is not None:
             views.append(stack.enter_context(rerun_recording(args.rrd, classes, min_score=min_score)))
         if getattr(args, "pictures", None) is not None:
@@ -110,6 +111,18 @@ def closing_at_failure(sinks: contextlib.ExitStack, done: Sized) -> Iterator[Non
             sinks.pop_all().close()
             tell(f"the outputs have the {len(done)} sweeps before the failure")
         raise
+
+
+def _collect(frames: list[PageFrame]) -> Callable[..., None]:
+    """A function that collects the frames of a page, as many as a browser can read."""
+
+    def add(*given: Any, **details: Any) -> None:
+        if sum(len(frame.points) for frame in frames) < _LARGEST_PAGE:
+            frames.append(page_frame(*given, **details))
+        else:
+            tell(f"note: --page ends after {len(frames)} clouds: browsers cannot read more", once="page")
+
+    return add
 
 
 def _details(record: Record, *, tracked: bool) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.cloud_policy import Cloud, unusable_cloud
 from fcos_lidar_jax.data.frame import unlabelled
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.inference.alignment import Alignment, align
@@ -64,11 +65,20 @@ def detect_stream(
         cloud, note, detections = found.cloud, found.note, found.detections
         assert cloud is not None
         assert found.sweep is not None
-        if note is None and cloud.points[cloud.valid, 4].min() > 0:
+        if note is None and shows_nothing_new(cloud, aligned.detector):
             note = f"{found.sweep.name}: only older sweeps have usable points"
         if note is not None:
             detections = dataclasses.replace(detections, valid=np.zeros_like(detections.valid))
         yield dataclasses.replace(found, detections=detections, note=note)
+
+
+def shows_nothing_new(cloud: Cloud, sensor: Sensor) -> bool:
+    """Whether only older ones of several fused sweeps have points in the range image."""
+    lag = cloud.points[:, 4]
+    if not (lag[cloud.valid] > 0).any():
+        return False
+    now = cloud.valid & (lag == 0)
+    return unusable_cloud("", cloud.points[now], now[now], 0, sensor) is not None
 
 
 def _requests(

@@ -19,7 +19,7 @@ from fcos_lidar_jax.workers import run_jobs
 
 _WORK = ".synthesize"
 _ORDER, _SHARDS = f"{_WORK}/order.json", f"{_WORK}/scenes"
-_FORMAT = 2  # increases when the bytes of the same specification change
+_FORMAT = 3  # increases when the bytes of the same specification change
 
 
 def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callable[[int], object]) -> bool:

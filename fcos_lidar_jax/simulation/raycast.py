@@ -13,7 +13,7 @@ from numpy.random import Generator
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.simulation.crossings import crossings, incidence
 from fcos_lidar_jax.simulation.ground import Ground
-from fcos_lidar_jax.simulation.solids import corners
+from fcos_lidar_jax.simulation.solids import corners, enclosing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,8 +114,7 @@ def _angular_bounds(rotation: np.ndarray, solids: np.ndarray) -> tuple[np.ndarra
     local = corners(solids) @ rotation
     flat = np.hypot(local[..., 0], local[..., 1])
     # Least distance of the cuboid from the sensor's axis, from its footprint in the world.
-    half = solids["half"][:, :2].copy()
-    half[:, 0] += np.abs(solids["lean"]) * solids["half"][:, 2]
+    half = enclosing(solids)[:, :2]
     c, s = np.cos(solids["yaw"]), np.sin(solids["yaw"])
     x, y = solids["center"][:, 0], solids["center"][:, 1]
     offset = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x], axis=1)) - half, 0)

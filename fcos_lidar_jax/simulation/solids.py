@@ -65,10 +65,18 @@ def place_solids(solids: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return placed
 
 
-def corners(solids: np.ndarray) -> np.ndarray:
-    """Corners of a cuboid that encloses each solid, including lean and taper, f64[s, 8, 3]."""
-    half = solids["half"].copy()
+def enclosing(solids: np.ndarray) -> np.ndarray:
+    """Half extents f64[s, 3] of a cuboid that encloses each solid, including lean and taper."""
+    half, taper = solids["half"].copy(), solids["taper"].copy()
+    taper[solids["kind"] == DRUM, 1] = taper[solids["kind"] == DRUM, 0]
+    half[:, :2] *= np.maximum(taper, 1)
     half[:, 0] += np.abs(solids["lean"]) * half[:, 2]
+    return half
+
+
+def corners(solids: np.ndarray) -> np.ndarray:
+    """Corners f64[s, 8, 3] of the cuboids of :func:`enclosing`."""
+    half = enclosing(solids)
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     c, s = np.cos(solids["yaw"])[:, None], np.sin(solids["yaw"])[:, None]
     x, y, z = np.moveaxis(half[:, None] * signs, -1, 0)

@@ -14,7 +14,7 @@ from made_bags import structured, write_recording
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, save_untrained
 
-from fcos_lidar_jax.cli import main
+from fcos_lidar_jax.cli import main, sinks
 from fcos_lidar_jax.cli import stream as cli_stream
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.geometry import pose_matrix
@@ -144,12 +144,16 @@ def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys
     assert [(line["timestamp_us"], line["sensor_to_world"]) for line in recorded] == [(t, None) for t in TIMES_US]
 
 
-def test_tracks_and_page(home, tmp_path):
+def test_tracks_and_page(home, tmp_path, capsys, monkeypatch):
     page = tmp_path / "page.html"
     lines = stream(
         home, tmp_path / "b.jsonl", home / "drive", "--poses", home / "poses.json", "--track --page", page
     )
-    plain = stream(home, tmp_path / "c.jsonl", home / "drive", "--poses", home / "poses.json")
+    monkeypatch.setattr(sinks, "_LARGEST_PAGE", 1)
+    short = home / "drive", "--poses", home / "poses.json", "--page", tmp_path / "short.html"
+    plain = stream(home, tmp_path / "c.jsonl", *short)
+    assert len(page_content(short[-1])["frames"]) == 1
+    assert "--page ends after 1 clouds: browsers" in capsys.readouterr().err
     for line, bare, frame in zip(lines, plain, page_content(page)["frames"], strict=True):
         ids = [box.pop("track") for box in line["boxes"]]
         assert len(set(ids)) == len(ids) > 0

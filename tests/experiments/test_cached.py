@@ -50,7 +50,7 @@ def test_requested_frames_are_made_once_and_come_back_bit_for_bit(tmp_path):
         cached = CachedFrames(toy, tmp_path / "new" / "cache")
         for index in (7, 2, 7):
             assert_same(cached.frame(index), made(index))
-        np.testing.assert_array_equal(cached.labels(2), made(2).labels)
+        np.testing.assert_array_equal(cached.labels(2), made(2).labels[made(2).num_points != 0])
     assert NOTED == [7, 2]
     assert cached.made() == [2, 7]
     assert (len(cached), cached.name(3), cached.fingerprint()) == (20, toy.name(3), toy.fingerprint())

@@ -55,6 +55,9 @@ def test_sweeps_without_usable_points_have_no_boxes_and_a_line(two_sweeps):
     sweeps = list(drive(4))
     sweeps[0] = dataclasses.replace(sweeps[0], points=sweeps[0].points[:0])
     sweeps[2] = dataclasses.replace(sweeps[2], points=sweeps[2].points * np.float32(np.nan))
+    far = dataclasses.replace(sweeps[2], points=sweeps[1].points + np.array([900, 0, 0, 0, 0], np.float32))
+    *_, lost = detect_stream([*sweeps[:2], far], two_sweeps)
+    assert (lost.note, lost.detections.valid.any()) == ("sweep 2: only older sweeps have usable points", False)
     stream = list(detect_stream(sweeps, two_sweeps))
     assert [each.note for each in stream] == [
         "sweep 0: no points in it, expected at least one",

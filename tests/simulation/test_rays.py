@@ -85,6 +85,17 @@ def test_first_hits_match_ray_marching(ground):
     assert met > 30
 
 
+@pytest.mark.parametrize("kind", [BOX, DRUM])
+def test_solids_that_are_wider_at_the_top_stop_all_rays_through_them(kind):
+    solids = make_solids(kind, [8, 0, 0], [0.4, 0.5, 0.8], taper=(1.4, 1.3), yaw=0.4, lean=0.2)
+    fan = Fan(np.radians(np.linspace(8, -8, 33)), 90, 0.15, 0.3 / 90, np.zeros(33))
+    hits = cast(fan, np.eye(3), np.zeros(3), solids, FAR_BELOW, np.random.default_rng(0))
+    way = np.arange(6, 10, 0.01)[:, None]
+    through = [(level(solids[0], way * d) < 0.99).any() for d in fan.directions.T.astype(float)]
+    assert 300 < np.sum(through) <= np.sum(hits.solid == 0)
+    assert (hits.solid[through] == 0).all()
+
+
 @pytest.mark.parametrize("kind", [BOX, DRUM, BALL, WHEEL])
 def test_incidence_matches_the_gradient_of_the_level_function(kind):
     rng = np.random.default_rng(kind)
