@@ -37,7 +37,7 @@ _MODULES = (
     *("assignment", "augment", "coding", "collectives", "config", "geometry", "iou", "locations", "losses", "nms"),
     *("presets", "projection", "sensors", "types"),
     *("centerpoint", "checkpoints", "data", "devices", "evaluation", "inference", "input_pipeline", "models"),
-    *("simulation", "training", "visualization"),
+    *("refinement", "simulation", "training", "visualization"),
 )
 
 

@@ -6,6 +6,8 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 
+REPEATED_S = 2.0  # `timeout` sends a signal to the process and to its group: until then it is the same one
+
 
 @contextlib.contextmanager
 def watch_signals(handle: Callable[[int], object]) -> Iterator[None]:

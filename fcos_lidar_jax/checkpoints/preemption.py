@@ -4,12 +4,13 @@ import contextlib
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from types import FrameType
 
 import jax
 
-from fcos_lidar_jax.signals import watch_signals
+from fcos_lidar_jax.signals import REPEATED_S, watch_signals
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -22,7 +23,8 @@ class StopRequest:
 
 @contextlib.contextmanager
 def stop_requests(line: str | None = None, *, active: bool = True) -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a request that the run checks between steps; a second Ctrl-C ends it.
+    """Turn the first Ctrl-C or SIGTERM into a request that the run checks between steps. A second Ctrl-C, at least
+    two seconds later, ends it.
 
     Further SIGTERMs change nothing, because clusters may send two; the command line ends the process at a later
     one. Signals keep their handlers with ``active=False`` and outside the main thread, where Python
@@ -30,16 +32,18 @@ def stop_requests(line: str | None = None, *, active: bool = True) -> Iterator[S
 
     The first signal prints the line, if one is given, on standard error at once, even while XLA compiles.
     """
-    request, told = StopRequest(), False
+    request, told, again_s = StopRequest(), False, 0.0
     in_main_thread = threading.current_thread() is threading.main_thread()
     handlers = {number: signal.getsignal(number) for number in _SIGNALS if active and in_main_thread}
+    interrupt = handlers.get(signal.SIGINT)
 
     def ask(number: int, frame: FrameType | None) -> None:
         # This handler stays, for the command line ends the process if the first signal has its own handler.
+        nonlocal again_s
         if request.signal is None:
-            request.signal = number
-        elif number == signal.SIGINT and callable(before := handlers[signal.SIGINT]):
-            before(number, frame)
+            request.signal, again_s = number, time.monotonic() + REPEATED_S
+        elif number == signal.SIGINT and callable(interrupt) and time.monotonic() > again_s:
+            interrupt(number, frame)
 
     def tell(number: int) -> None:
         nonlocal told

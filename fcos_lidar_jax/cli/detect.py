@@ -20,6 +20,7 @@ from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.recorded import usual_sensor
+from fcos_lidar_jax.data.ros_bags import is_ros_bag
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
@@ -118,6 +119,8 @@ def _inputs(inputs: tuple[Path, ...], listed: Path | None) -> tuple[tuple[Path, 
     for file in inputs:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
+        if is_ros_bag(file):
+            raise ValueError(f"{file}: found a recording, expected point files: fcos-lidar stream reads it")
     if listed is None:
         distinct = dict[str, Path]()
         for file in find_clouds(inputs):

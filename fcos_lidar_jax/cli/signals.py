@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
-from fcos_lidar_jax.signals import watch_signals
+from fcos_lidar_jax.signals import REPEATED_S, watch_signals
 
 _BLOCKED_S = 5.0  # the main thread answers a signal sooner, unless C code blocks it, such as a compilation
-_REPEATED_S = 2.0  # `timeout` sends a signal to the process and to its group: until then it is the same one
 
 
 @contextlib.contextmanager
@@ -42,7 +41,7 @@ def ending_signals(program: str) -> Iterator[None]:
             first_s = time.monotonic()
             if signal.getsignal(number) is end and not answered.wait(_BLOCKED_S):
                 _end(program, number)
-        elif time.monotonic() - first_s > _REPEATED_S:
+        elif time.monotonic() - first_s > REPEATED_S:
             _end(program, number)
 
     for number in before:

@@ -236,7 +236,7 @@ def check_run(folder: str | Path, spec: dict[str, Any], *, resume: bool) -> None
     recorded = {name: value for name, value in recorded.items() if name in spec}
     for name, was, now in _differences(recorded, spec):
         # Runs of earlier versions lack the hash, and a run with checkpoints does not use its first weights again.
-        if name == "weights_hash" and (name not in recorded or checkpoints):
+        if name in ("weights", "weights_hash") and (name not in recorded or checkpoints):
             continue
         raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
 

@@ -57,6 +57,7 @@ detect HOME/away.npy HOME/no_rows.npy => away.npy: none of its .* points is usab
 detect HOME/training => training: no point file in it, expected [^;]*$
 detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
 detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, 
+detect HOME/a.bag => a.bag: found a recording, expected point files: fcos-lidar stream reads it$
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
 detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
 detect --sweeps HOME/s.json --full-turn => --sweeps: got .*, expected none with --full-turn: 

@@ -463,8 +463,11 @@ def test_a_folder_without_the_run_is_refused_and_unchanged(finished, tmp_path, c
 
 def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(finished, begun):
     spec = json.loads((begun / "run.json").read_text())
-    other = spec | {"weights_hash": "0123"}
+    other = spec | {"weights": "elsewhere", "weights_hash": "0123"}
     plan.check_run(finished[0], other, resume=True)  # from its own checkpoint
+    with pytest.raises(ValueError, match=r"run.json: weights: was None, got 'elsewhere': only the same run"):
+        plan.check_run(begun, other, resume=True)
+    other["weights"] = None
     with pytest.raises(ValueError, match=r"run.json: weights_hash: was '\w+', got '0123': only the same run"):
         plan.check_run(begun, other, resume=True)
     del spec["weights_hash"]  # as in a run of an earlier version
