@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
+from typing import ClassVar
 
 import jax
 
@@ -19,6 +20,7 @@ class StopRequest:
     """Whether a run has been asked to stop."""
 
     signal: int | None = None  # SIGINT (Ctrl-C) or SIGTERM; None without a request
+    until_s: ClassVar[float] = 0.0  # a Ctrl-C until this time repeats the process's last request
 
 
 @contextlib.contextmanager
@@ -32,17 +34,19 @@ def stop_requests(line: str | None = None, *, active: bool = True) -> Iterator[S
 
     The first signal prints the line, if one is given, on standard error at once, even while XLA compiles.
     """
-    request, told, again_s = StopRequest(), False, 0.0
+    request, told, outer_s = StopRequest(), False, StopRequest.until_s
     in_main_thread = threading.current_thread() is threading.main_thread()
     handlers = {number: signal.getsignal(number) for number in _SIGNALS if active and in_main_thread}
     interrupt = handlers.get(signal.SIGINT)
 
     def ask(number: int, frame: FrameType | None) -> None:
         # This handler stays, for the command line ends the process if the first signal has its own handler.
-        nonlocal again_s
+        now_s = time.monotonic()
+        if number == signal.SIGINT and now_s < StopRequest.until_s:
+            return
         if request.signal is None:
-            request.signal, again_s = number, time.monotonic() + REPEATED_S
-        elif number == signal.SIGINT and callable(interrupt) and time.monotonic() > again_s:
+            request.signal, StopRequest.until_s = number, now_s + REPEATED_S
+        elif number == signal.SIGINT and callable(interrupt):
             interrupt(number, frame)
 
     def tell(number: int) -> None:
@@ -61,6 +65,8 @@ def stop_requests(line: str | None = None, *, active: bool = True) -> Iterator[S
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
+        if request.signal is not None:
+            StopRequest.until_s = outer_s
 
 
 def take_sigterm_back() -> None:

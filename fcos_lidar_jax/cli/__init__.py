@@ -64,6 +64,8 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     Raises:
         SystemExit: with 143 or 129 after SIGTERM or SIGHUP, or raised by ``work``.
     """
+    if sys.stderr is None:  # else notes and errors would go to standard output
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):  # standard error already escapes what it cannot encode
         with contextlib.suppress(OSError):  # a full disk is reported below
             sys.stdout.reconfigure(errors="replace")

@@ -25,7 +25,7 @@ from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
-from fcos_lidar_jax.inference.stream import shows_nothing_new
+from fcos_lidar_jax.inference.stream import only_older
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E
 
@@ -92,8 +92,10 @@ def run(args: Detect) -> None:
 
     def entries(found: Prediction) -> tuple[list[dict[str, Any]], str]:
         assert found.cloud is not None
-        nothing = found.note is not None or (sweeps and shows_nothing_new(found.cloud, detector.sensor))
-        min_score = math.inf if nothing else args.min_score  # without usable points, no boxes
+        note = found.note
+        if sweeps and note is None and (note := only_older(files[0], found.cloud, detector.sensor)):
+            tell(f"note: {note}")
+        min_score = args.min_score if note is None else math.inf  # without usable points, no boxes
         kept = select(found.detections, classes, min_score=min_score, labels=args.labels)
         record = {"file": str(files[found.index]), **cloud_record(kept, found.cloud, classes)}
         clear = sum(box["score"] >= shown_score for box in record["boxes"])
@@ -119,8 +121,8 @@ def _inputs(inputs: tuple[Path, ...], listed: Path | None) -> tuple[tuple[Path, 
     for file in inputs:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
-        if is_ros_bag(file):
-            raise ValueError(f"{file}: found a recording, expected point files: fcos-lidar stream reads it")
+        if not file.is_dir() and is_ros_bag(file):
+            raise ValueError(f"{file}: got a recording, expected point files: fcos-lidar stream reads it")
     if listed is None:
         distinct = dict[str, Path]()
         for file in find_clouds(inputs):

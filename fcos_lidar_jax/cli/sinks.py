@@ -1,6 +1,7 @@
 """The outputs of ``detect`` and ``stream``: boxes in several formats, pictures, a page, and a recording."""
 
 import contextlib
+import dataclasses
 import itertools
 import json
 import tempfile
@@ -34,7 +35,7 @@ Add = Callable[[Record, np.ndarray], None]
 
 
 _LABEL_COLUMNS = 15  # Results have a score after them.
-_LARGEST_PAGE = 4e8  # Characters of encoded points; the longest text of browsers has 2**29.
+_LARGEST_PAGE = 5e8  # Characters; the longest text of browsers has 2**29.
 _TYPES = kitti_types(TO_NUSCENES) | kitti_types()
 
 
@@ -54,12 +55,12 @@ def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Seq
         if len(set(stems)) < len(stems):
             raise ValueError(f"{option}: got clouds of the same name, expected different names")
         for cloud, stem in zip(clouds, stems, strict=True):
-            calibration = _calibration(args.calibration, cloud, stem)
-            read_calibration(calibration)
-            check_out_file("--out", args.out / f"{stem}.txt", [calibration])
+            read_calibration(_calibration(args.calibration, cloud, stem))
+        check_out_file("--out", args.out / "000000.txt", [])
         for file in sorted(args.out.glob("*.txt")):
-            if any(len(line.split()) == _LABEL_COLUMNS for line in file.read_text(errors="replace").splitlines()):
-                raise ValueError(f"--out: {file}: found labels, which have no score, expected results or nothing")
+            lines = [line.split() for line in file.read_text(errors="replace").splitlines()]
+            if any(len(words) == _LABEL_COLUMNS or words[:1] == ["P2:"] for words in lines):
+                raise ValueError(f"--out: {file}: found labels or a calibration, expected results or nothing")
 
 
 @contextlib.contextmanager
@@ -116,9 +117,13 @@ def closing_at_failure(sinks: contextlib.ExitStack, done: Sized) -> Iterator[Non
 def _collect(frames: list[PageFrame]) -> Callable[..., None]:
     """A function that collects the frames of a page, as many as a browser can read."""
 
+    size = 0
+
     def add(*given: Any, **details: Any) -> None:
-        if sum(len(frame.points) for frame in frames) < _LARGEST_PAGE:
-            frames.append(page_frame(*given, **details))
+        nonlocal size
+        if size < _LARGEST_PAGE:
+            frames.append(frame := page_frame(*given, **details))
+            size += len(json.dumps(dataclasses.asdict(frame)))
         else:
             tell(f"note: --page ends after {len(frames)} clouds: browsers cannot read more", once="page")
 

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -65,20 +66,19 @@ def detect_stream(
         cloud, note, detections = found.cloud, found.note, found.detections
         assert cloud is not None
         assert found.sweep is not None
-        if note is None and shows_nothing_new(cloud, aligned.detector):
-            note = f"{found.sweep.name}: only older sweeps have usable points"
+        note = note or only_older(found.sweep.name, cloud, aligned.detector)
         if note is not None:
             detections = dataclasses.replace(detections, valid=np.zeros_like(detections.valid))
         yield dataclasses.replace(found, detections=detections, note=note)
 
 
-def shows_nothing_new(cloud: Cloud, sensor: Sensor) -> bool:
-    """Whether only older ones of several fused sweeps have points in the range image."""
+def only_older(name: str | Path, cloud: Cloud, sensor: Sensor) -> str | None:
+    """A line about fused sweeps, of which only older ones have points in the range image, or None."""
     lag = cloud.points[:, 4]
-    if not (lag[cloud.valid] > 0).any():
-        return False
     now = cloud.valid & (lag == 0)
-    return unusable_cloud("", cloud.points[now], now[now], 0, sensor) is not None
+    if not (lag[cloud.valid] > 0).any() or unusable_cloud(name, cloud.points[now], now[now], 0, sensor) is None:
+        return None
+    return f"{name}: only older sweeps have usable points"
 
 
 def _requests(

@@ -9,7 +9,7 @@ from numpy.random import Generator
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.raycast import Fan, Hits, cast
-from fcos_lidar_jax.simulation.solids import BOX, EGO, make_solids, place_solids
+from fcos_lidar_jax.simulation.solids import BOX, EGO, enclosing, make_solids, place_solids
 from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.world import World
 
@@ -259,7 +259,7 @@ def _ego_edges(fan: Fan, blocked: np.ndarray, edges_m: np.ndarray) -> tuple[np.n
 
 def _in_view(solids: np.ndarray, fan: Fan, rotation: np.ndarray, eye: np.ndarray, farthest: float) -> np.ndarray:
     """Solids within range, without those that certainly lie outside the fan."""
-    radius = np.linalg.norm(solids["half"], axis=1) + np.abs(solids["lean"]) * solids["half"][:, 2]
+    radius = np.linalg.norm(enclosing(solids), axis=1)
     x, y = (solids["center"] - eye)[:, :2].T
     distance = np.hypot(x, y)
     kept = distance < farthest + radius

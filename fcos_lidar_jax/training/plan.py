@@ -142,6 +142,9 @@ class Run:
 
 def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     """Plan a run, and refuse one that cannot be trained."""
+    begun = bool(spec.resume and Checkpoints(spec.out / CHECKPOINTS).paths())
+    if begun and spec.weights is None:  # they are not used again
+        spec = dataclasses.replace(spec, weights=_recorded_run(spec.out).get("weights"))
     config, frames = spec.config, spec.frames
     order = SampleOrder(frames, config, seed=spec.seed)
     for read in filter(None, (frames, spec.tests)):
@@ -155,10 +158,14 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     if config.augment is not None:
         check_augmentation(config.augment, frames.sensor)
     if config.trains_second_look_only:
-        check(spec.weights is not None, "refinement.freeze_detector", True, "False without weights of a detector")
+        check(
+            begun or spec.weights is not None,
+            "refinement.freeze_detector",
+            True,
+            "False without weights of a detector",
+        )
     detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, spec.steps)
     jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(spec.seed))
-    begun = spec.resume and Checkpoints(spec.out / CHECKPOINTS).paths()
     weights = None if begun else _initial_weights(detector, spec.weights, spec.seed)
     warnings = tuple(_warnings(frames, config))
     return Run(spec, _record(spec, detector, weights), detector, optimizer, order, weights, warnings)
@@ -220,6 +227,10 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
         )
 
 
+def _recorded_run(folder: Path) -> dict[str, Any]:
+    return read_json(folder / RUN_SPEC, dict[str, Any], what="the specification of the run to resume")
+
+
 def check_run(folder: str | Path, spec: dict[str, Any], *, resume: bool) -> None:
     """Check that a run can be started or resumed in a folder; names the first field in which another run differs.
 
@@ -232,11 +243,10 @@ def check_run(folder: str | Path, spec: dict[str, Any], *, resume: bool) -> None
         if checkpoints or file.exists() or (folder / METRICS).exists():
             raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
         return
-    recorded = read_json(file, dict[str, Any], what="the specification of the run to resume")
-    recorded = {name: value for name, value in recorded.items() if name in spec}
+    recorded = {name: value for name, value in _recorded_run(folder).items() if name in spec}
     for name, was, now in _differences(recorded, spec):
         # Runs of earlier versions lack the hash, and a run with checkpoints does not use its first weights again.
-        if name in ("weights", "weights_hash") and (name not in recorded or checkpoints):
+        if name == "weights_hash" and (name not in recorded or checkpoints):
             continue
         raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
 

@@ -34,22 +34,43 @@ def handlers():
     return [signal.getsignal(number) for number in SIGNALS]
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-def test_the_first_signal_is_a_request_and_a_later_ctrl_c_is_handled_as_before(previous, monkeypatch, number):
-    clock = types.SimpleNamespace(monotonic=iter([7.0, 8.9, *[9.1] * 4]).__next__)
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that the tests set."""
+    clock = types.SimpleNamespace(now_s=7.0, monotonic=lambda: clock.now_s)
     monkeypatch.setattr(preemption, "time", clock)
+    return clock
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_the_first_signal_is_a_request_and_a_later_ctrl_c_is_handled_as_before(previous, clock, number):
     with stop_requests() as request:
         assert request.signal is None
         os.kill(os.getpid(), number)
         assert request.signal == number
         os.kill(os.getpid(), signal.SIGINT)  # `timeout` sends it twice
+        clock.now_s += 2.5
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGTERM)
             with after_the_block():  # while a checkpoint is saved
                 os.kill(os.getpid(), signal.SIGTERM)
+            clock.now_s += 2.5
             with pytest.raises(Handled):
                 os.kill(os.getpid(), signal.SIGINT)
     assert request.signal == number
+
+
+@pytest.mark.parametrize("saving", [False, True])
+def test_a_repeated_ctrl_c_counts_once_also_while_a_checkpoint_is_saved(previous, clock, saving):
+    with stop_requests() as request:
+        if not saving:
+            os.kill(os.getpid(), signal.SIGINT)
+        with after_the_block():
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGINT)
+            clock.now_s += 3.0  # the checkpoint takes long
+        assert request.signal == signal.SIGINT
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def test_handlers_are_restored_after_the_block_and_after_an_error(previous):

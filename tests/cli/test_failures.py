@@ -214,11 +214,16 @@ def test_an_output_on_a_full_disk_is_one_line(tmp_path, work):
 
 
 @pytest.mark.parametrize("closed", [("stdout",), ("stderr",), ("stdout", "stderr")])
-def test_closed_outputs_are_left_out(monkeypatch, closed):
+def test_closed_outputs_are_left_out(monkeypatch, capsys, closed):
     for name in closed:  # Python gives a process without a descriptor None
         monkeypatch.setattr(sys, name, None)
     assert exit_code("program", lambda: print("text")) == 0
-    assert exit_code("program", fail_with(ValueError("text"))) == 1
+    assert exit_code("program", fail_with(ValueError("message"))) == 1
+    if "stderr" in closed:
+        sys.stderr.close()
+    printed = capsys.readouterr()
+    assert printed.out == ("" if "stdout" in closed else "text\n")
+    assert ("message" in printed.err) == ("stderr" not in closed)
 
 
 URL_HINT = "got a URL, expected a path: copy the files (gsutil, aws s3) or mount the bucket (gcsfuse)"

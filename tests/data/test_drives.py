@@ -103,19 +103,18 @@ def test_names_that_are_not_sorted_by_their_numbers_are_refused(poses):
 
 
 @pytest.mark.parametrize(
-    ("names", "clouds", "message"),
+    ("names", "message"),
     [
-        ("aa", "a", "poses.json: got 2 entries for 1 clouds, expected each once"),
-        ("b", "a", "poses.json: no pose of"),
-        ("ab", "ab", "poses.json: timestamp_us: got 1e+08 (median), expected microseconds"),
+        ("aa", "poses.json: got 2 entries for 1 clouds, expected each once"),
+        ("b", "poses.json: no pose of"),
     ],
 )
-def test_a_list_needs_every_cloud_once_with_its_time(poses, names, clouds, message):
-    pose = {"sensor_to_world": np.eye(4).tolist()}
-    listed = [{"file": f"clouds/{name}.npy", "timestamp_us": i * 10**8, **pose} for i, name in enumerate(names)]
+def test_a_list_needs_every_cloud_once(poses, names, message):
+    entry = {"sensor_to_world": np.eye(4).tolist(), "timestamp_us": 0}
+    listed = [{"file": f"clouds/{name}.npy", **entry} for name in names]
     (poses / "poses.json").write_text(json.dumps(listed))
     with refused(message):
-        drive_of(poses, *clouds, poses="poses.json")
+        drive_of(poses, "a", poses="poses.json")
 
 
 @pytest.mark.parametrize(

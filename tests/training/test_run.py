@@ -33,6 +33,7 @@ from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.devices.feeding import feed
+from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.input_pipeline.database import prepare_database
 from fcos_lidar_jax.models import build_detector
@@ -463,16 +464,23 @@ def test_a_folder_without_the_run_is_refused_and_unchanged(finished, tmp_path, c
 
 def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(finished, begun):
     spec = json.loads((begun / "run.json").read_text())
-    other = spec | {"weights": "elsewhere", "weights_hash": "0123"}
+    other = spec | {"weights_hash": "0123"}
     plan.check_run(finished[0], other, resume=True)  # from its own checkpoint
-    with pytest.raises(ValueError, match=r"run.json: weights: was None, got 'elsewhere': only the same run"):
-        plan.check_run(begun, other, resume=True)
-    other["weights"] = None
     with pytest.raises(ValueError, match=r"run.json: weights_hash: was '\w+', got '0123': only the same run"):
         plan.check_run(begun, other, resume=True)
     del spec["weights_hash"]  # as in a run of an earlier version
     (begun / "run.json").write_text(json.dumps(spec))
     plan.check_run(begun, other, resume=True)
+
+
+def test_a_resumed_run_keeps_its_first_weights_without_their_name(finished, tmp_path):
+    folder = shutil.copytree(finished[0], tmp_path / "run")
+    spec = json.loads((folder / "run.json").read_text()) | {"weights": "elsewhere"}
+    (folder / "run.json").write_text(json.dumps(spec))
+    again = plan.RunSpec(CONFIG, FRAMES, folder, steps=STEPS, tests=TESTS, resume=True)
+    assert plan.plan_run(again, make_mesh(jax.local_devices()[:1])).record["weights"] == "elsewhere"
+    frozen = dataclasses.replace(again, config=FROZEN)  # the arrays are in its checkpoints
+    assert plan.plan_run(frozen, make_mesh(jax.local_devices()[:1])).weights is None
 
 
 def in_memory(*frames: Frame) -> InMemoryFrames:
