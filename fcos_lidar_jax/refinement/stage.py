@@ -120,7 +120,7 @@ def look_inputs(config: Config, sensor: Sensor, points: Array, valid: Array, box
     refinement = _config_of(config)
     place, scores, labels, used = boxes
     crops = crop_points(points, valid, place, num_points=refinement.num_points, margin_m=refinement.margin_m)
-    seen = place.at[:, :3].add(-jnp.array(sensor.origin_m, jnp.float32))
+    seen = jnp.concatenate([place[:, :3] - jnp.array(sensor.origin_m, jnp.float32), place[:, 3:]], axis=1)
     of_boxes = box_features(
         seen, scores, labels, crops.count, len(config.classes), with_velocity=_sees_motion(config)
     )

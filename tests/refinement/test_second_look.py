@@ -225,8 +225,9 @@ def test_a_sensor_off_the_origin_sees_the_same():
         points[:, :3] += origin
         boxes[:, :3] += origin
         sensor = dataclasses.replace(SENSOR, origin_m=tuple(origin))
-        seen = boxes, np.array([0.9, 0.5]), np.array([0, 1]), np.ones(2, bool)
-        found.append(look_inputs(detector(SMALL)[0].config, sensor, points, batch.valid[0], seen).boxes)
+        seen = boxes, np.array([0.9, 0.5], np.float32), np.array([0, 1]), np.ones(2, bool)
+        given = jax.tree.map(jnp.asarray, (points, batch.valid[0], seen))
+        found.append(look_inputs(detector(SMALL)[0].config, sensor, *given).boxes)
     np.testing.assert_allclose(*found, atol=1e-5)
 
 
