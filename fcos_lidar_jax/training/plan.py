@@ -158,12 +158,8 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     if config.augment is not None:
         check_augmentation(config.augment, frames.sensor)
     if config.trains_second_look_only:
-        check(
-            begun or spec.weights is not None,
-            "refinement.freeze_detector",
-            True,
-            "False without weights of a detector",
-        )
+        has_weights = begun or spec.weights is not None
+        check(has_weights, "refinement.freeze_detector", True, "False without weights of a detector")
     detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, spec.steps)
     jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(spec.seed))
     weights = None if begun else _initial_weights(detector, spec.weights, spec.seed)
