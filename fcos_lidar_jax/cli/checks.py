@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -66,7 +67,7 @@ class _Option:
 def check_options(command: Any) -> None:
     """Check every option of a command by the rules of its field: :class:`~.fields.Bounds` and the classes above.
 
-    Raises ValueError, or OSError for an output that cannot be written.
+    Raises ValueError, or OSError for an output that cannot be written. Exits with 2 if an option is missing.
     """
     options = dict(_options(command))
     for name, option in options.items():
@@ -98,7 +99,9 @@ def _check_rules(name: str, options: dict[str, _Option]) -> None:
             case Bounds() if option.value is not None and not rule.hold(option.value):
                 expected = str(rule)
             case Or(other) if not option.is_given and not options[other].is_given:
-                expected = f"one, or {option_name(other)}"
+                line = f"{option_name(name)}: got none, expected one, or {option_name(other)}"
+                print(f"fcos-lidar: error: {line}", file=sys.stderr)
+                sys.exit(2)  # as for options that are always required
             case Needs(other, value) if option.is_given and not _has(options[other], value):
                 expected = f"only with {option_name(other)} {value}".rstrip()
             case Excludes(others, why) if option.is_given and any(options[other].is_given for other in others):
@@ -106,8 +109,7 @@ def _check_rules(name: str, options: dict[str, _Option]) -> None:
                 expected = f"none with {option_name(beside)}: {why}"
             case _:
                 continue
-        got = "none" if option.value in (None, ()) else option.value
-        raise ValueError(f"{option_name(name)}: got {got}, expected {expected}")
+        raise ValueError(f"{option_name(name)}: got {option.value}, expected {expected}")
 
 
 def _has(option: _Option, value: str) -> bool:

@@ -1,4 +1,4 @@
-"""``fcos-lidar detect``: the boxes of point files."""
+"""``fcos-lidar detect``: the boxes of point files, or of a recording."""
 
 import dataclasses
 import json
@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 
-from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import Excludes, Or, Output
+from fcos_lidar_jax.cli import options, stream
+from fcos_lidar_jax.cli.checks import Excludes, Or, Output, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.sinks import check_results, open_sinks
 from fcos_lidar_jax.data.cloud_policy import truncation
@@ -20,28 +20,32 @@ from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.recorded import usual_sensor
-from fcos_lidar_jax.data.ros_bags import is_ros_bag
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.inference.stream import only_older
+from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, find_recording
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E
 
 _LISTED = Excludes(("files", "full_turn"), "the list names the files, which keep all points")
-_INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
+_INPUT = (
+    f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them; or one recording that "
+    "`fcos-lidar stream` reads, whose sweeps are fused if it has poses."
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Detect:
-    """Detect boxes in point files and write them as JSON, or in the format of an annotation tool.
+    """Detect boxes in point files, or a recording, and write them as JSON, or in the format of an annotation
+    tool.
 
     A box is [x, y, z, l, w, h, yaw, vx, vy]: centre, length along the heading, width and height in metres, yaw in
     radians counter-clockwise from +x, velocity in m/s, all in the frame of the points.
 
     After Ctrl-C or a kill, the same command resumes and repeats only a few clouds, even if files were added or
-    removed since. A file that is given twice is processed once.
+    removed since; a recording starts again. A file that is given twice is processed once.
     """
 
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], Or("sweeps"), option("INPUT", text=_INPUT)]]
@@ -72,6 +76,11 @@ class Detect:
 
 def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
+    if drives := [path for path in args.files if path.exists() and find_recording(path) is not FOLDER]:
+        if len(args.files) > 1:
+            raise ValueError(f"{drives[0]}: got a recording beside other inputs, expected only the recording")
+        stream.run(_as_stream(args), in_lines=False)
+        return
     files, sweeps = _inputs(args.files, args.sweeps)
     if args.full_turn and not any(usual_sensor(file) == KITTI_HDL64E for file in files):
         raise ValueError(f"--full-turn: expected none for {files[0]}: only files of KITTI are cropped")
@@ -116,13 +125,21 @@ def run(args: Detect) -> None:
         tell(line)
 
 
+def _as_stream(args: Detect) -> stream.Stream:
+    """The options for a recording; rejects options that only point files have."""
+    shared = {field.name for field in dataclasses.fields(stream.Stream)}
+    for field in dataclasses.fields(Detect):
+        if field.name not in {*shared, "files"} and getattr(args, field.name) != field.default:
+            raise ValueError(f"{option_name(field.name)}: {args.files[0]}: got a recording, expected point files")
+    given = {name: value for name, value in vars(args).items() if name in shared}
+    return stream.Stream(source=args.files[0], **given)
+
+
 def _inputs(inputs: tuple[Path, ...], listed: Path | None) -> tuple[tuple[Path, ...], list[ListedSweep]]:
     """The files, each once; or the list of sweeps, and its entries with the paths of their files."""
     for file in inputs:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
-        if not file.is_dir() and is_ros_bag(file):
-            raise ValueError(f"{file}: got a recording, expected point files: fcos-lidar stream reads it")
     if listed is None:
         distinct = dict[str, Path]()
         for file in find_clouds(inputs):

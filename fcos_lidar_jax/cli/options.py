@@ -15,7 +15,13 @@ from fcos_lidar_jax.inference.alignment import Alignment, align
 from fcos_lidar_jax.progress import tell
 
 
-def option(metavar: str | None = None, *, default: str | None = None, text: str | None = None) -> Any:
+def option(
+    metavar: str | None = None,
+    *,
+    default: str | None = None,
+    text: str | None = None,
+    aliases: tuple[str, ...] = (),
+) -> Any:
     """Describe an option in the help: the placeholder of its value, and the text shown for a default of None.
 
     Without ``default``, the help calls an option optional if its default is None. By default, the text is the
@@ -26,7 +32,7 @@ def option(metavar: str | None = None, *, default: str | None = None, text: str 
         shown = default or ("" if label in ("None", "") else label)
         return f"(default: {shown})" if shown else "(optional)"
 
-    return tyro.conf.arg(metavar=metavar, help=text, help_behavior_hint=hint)
+    return tyro.conf.arg(metavar=metavar, help=text, help_behavior_hint=hint, aliases=aliases)
 
 
 _DETECTOR = (

@@ -37,7 +37,8 @@ class Prepare:
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
     train_split: Annotated[
-        str | None, option("SPLIT", default="train, mini_train, or all frames without splits")
+        str | None,
+        option("SPLIT", default="train, mini_train, or all frames without splits", aliases=("--split",)),
     ] = None
     """Split to extract objects from. A nuScenes version without annotations only gets an index."""
     num_sweeps: Count = NUSCENES.num_sweeps  # Sweeps per object, if the data have sweeps.

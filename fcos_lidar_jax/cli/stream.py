@@ -103,8 +103,10 @@ class Stream:
     max_file_points: options.MaxFilePoints = MAX_POINTS
 
 
-def run(args: Stream) -> None:
-    """Detect, and add every sweep to all outputs as soon as it is ready."""
+def run(args: Stream, *, in_lines: bool = True) -> None:
+    """Detect, and add every sweep to all outputs as soon as it is ready. With ``in_lines``, JSON has one line per
+    sweep, otherwise the layout of ``fcos-lidar detect``.
+    """
     if args.track and args.min_score is None:
         args = dataclasses.replace(args, min_score=_TRACKED_SCORE)
     kind = _find(args)
@@ -120,7 +122,7 @@ def run(args: Stream) -> None:
         how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
     notes, num_truncated, progress = list[str | None](), 0, Progress("sweeps", None)
     add_tracks = _tracker(classes)
-    views = {"title": args.scene or str(args.source), "in_lines": True}
+    views = {"title": args.scene or str(args.source), "in_lines": in_lines}
     with contextlib.ExitStack() as sinks, _Timing() as timing:
         sinks.callback(_tell_notes, drive.notes)  # also if the source fails
         add = sinks.enter_context(open_sinks(args, classes, aligned.data, **views))

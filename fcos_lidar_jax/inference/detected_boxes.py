@@ -36,8 +36,8 @@ class DetectedBoxes:
     1 box
     class  score       x       y       z      l      w      h    yaw     vx     vy
     bus     0.50    8.00    0.00    0.00   4.00   2.00   1.50   0.00   3.00   0.00
-    >>> len(found), found[0].name, len(found[:5]), found.names.tolist(), found.select(min_score=0.6).boxes.shape
-    (1, 'bus', 1, ['bus'], (0, 9))
+    >>> len(found), found[0].name, len(found[:5]), found.names.tolist(), found.select(min_score=0.6).valid.shape
+    (1, 'bus', 1, ['bus'], (0,))
     """
 
     boxes: np.ndarray  # f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy, see :mod:`fcos_lidar_jax.types`
@@ -52,6 +52,11 @@ class DetectedBoxes:
     def names(self) -> np.ndarray:
         """str[m]: classes of the boxes."""
         return np.array(self.classes)[self.labels]
+
+    @property
+    def valid(self) -> np.ndarray:
+        """bool[m]: True, as there is no padding, for code that also takes the padded ``Detections``."""
+        return np.ones(len(self), bool)
 
     def __len__(self) -> int:
         return len(self.boxes)

@@ -50,14 +50,15 @@ def home(tmp_path_factory):
 
 # With "--out OUT" unless the line says otherwise, and for some commands with "--checkpoint HOME/checkpoint".
 BAD = mistakes(r"""
-detect => INPUT: got none, expected one, or --sweeps$
 detect HOME/good.npy --sweeps HOME/poses.json => --sweeps: got .*, expected none with INPUT: 
 detect HOME/good.npy HOME/none.npy => none.npy: no such file
 detect HOME/away.npy HOME/no_rows.npy => away.npy: none of its .* points is usable
 detect HOME/training => training: no point file in it, expected [^;]*$
 detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
 detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, 
-detect HOME/a.bag => a.bag: got a recording, expected point files: fcos-lidar stream reads it$
+detect HOME/a.bag => a.bag: cannot be read: 
+detect HOME/good.npy HOME/a.bag => a.bag: got a recording beside other inputs, expected only the recording$
+detect HOME/a.bag --full-turn => --full-turn: .*a.bag: got a recording, expected point files$
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
 detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
 detect --sweeps HOME/s.json --full-turn => --sweeps: got .*, expected none with --full-turn: 
@@ -81,7 +82,6 @@ detect HOME/none.npy --out HOME/good.npy/x => good.npy: found a file, expected a
 detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*the place of the checkpoint
 detect HOME/good.npy --checkpoint HOME/detector.fcos --batch-size 2 => batch size: got 2, expected 1
 detect HOME/none.npy --pictures HOME/good.npy => good.npy: found a file, expected a folder
-stream => SOURCE: got none, expected one, or --data-root$
 stream HOME/nowhere --out OUT/x => nowhere: no such file or folder
 stream HOME/training/velodyne --track => --track: found no poses
 stream HOME/training/velodyne --keyframes => --keyframes: expected only with --data-root
@@ -90,7 +90,6 @@ stream HOME/a.bag --odometry tf --poses HOME/poses.json => --poses: got .*, expe
 stream --data-root HOME => --data-root: got .*, expected only with --scene$
 stream --data-root HOME --scene a --intensity-scale 9 => --intensity-scale: got 9.0, expected none with
 stream --data-root HOME/data --scene scene-0 --output-format nuscenes => expected --keyframes with --data-root
-evaluate => --checkpoint: got none, expected one, or --results$
 evaluate --results HOME/truth.json => data root: missing, expected the folder of a data set
 evaluate --checkpoint x --ground-truth HOME/truth.json => --ground-truth: .* expected none with --checkpoint
 evaluate --results x --ground-truth HOME/truth.json --version v1 => --ground-truth: .* none with --version

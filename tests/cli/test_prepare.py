@@ -44,7 +44,7 @@ def test_prints_a_record_and_a_second_run_changes_nothing(root, tmp_path, capsys
 
 
 def test_objects_come_only_from_the_training_split(root, tmp_path):
-    command(*prepare(root, tmp_path / "i", "--train-split", "scene-1"))
+    command(*prepare(root, tmp_path / "i", "--split", "scene-1"))
     data = NuScenes(root, VERSION)
     own, other = (
         {b.tobytes() for t in data.split(s) for b in data.boxes(t).boxes} for s in ("scene-1", "scene-2")

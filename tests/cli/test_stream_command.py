@@ -142,6 +142,8 @@ def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys
     assert {line["timestamp_us"] for line in lines} == {None}
     recorded = stream(home, tmp_path / "a.jsonl", home / "mcap")  # whose times are known
     assert [(line["timestamp_us"], line["sensor_to_world"]) for line in recorded] == [(t, None) for t in TIMES_US]
+    command("detect", home / "mcap", *where)
+    assert json.loads((tmp_path / "b.json").read_text()) == {"files": recorded}
 
 
 def test_tracks_and_page(home, tmp_path, capsys, monkeypatch):
@@ -250,3 +252,5 @@ def test_a_log_of_argoverse2_is_a_source(home, tmp_path):
     assert np.diff([line["timestamp_us"] for line in lines]).tolist() == [STEP_NS // 1000] * 3
     for index, line in enumerate(lines):
         assert line["sensor_to_world"] == frames.pose(index).tolist()
+    command("detect", log, "--checkpoint", home / "checkpoint", "--out", tmp_path / "a.json")
+    assert json.loads((tmp_path / "a.json").read_text()) == {"files": lines}
