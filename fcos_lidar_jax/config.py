@@ -105,7 +105,7 @@ class ModelConfig(Checked):
     tied_heads: bool = False  # Share one head between all levels (table 6).
     regression_axes: Literal["lidar", "ray"] = "lidar"
     """Axes of the predicted centre offset and velocity: the LiDAR frame's, as in equation 2, or the direction of
-    the point's azimuth and the direction to its left (not in the paper), see :mod:`fcos_lidar_jax.coding`."""
+    the point's azimuth and the direction to its left (not in the paper)."""
     local_geometry: bool = False
     """Not in the paper: the offsets from each location's point to the points of the neighbouring pixels are an
     additional input of the heads, see ``fcos_lidar_jax.models.local_geometry``."""
@@ -145,11 +145,11 @@ class LossConfig(Checked):
     iou_prediction_weight: Amount = 1.0  # Our choice: weight of the predicted IoU's binary cross-entropy.
     velocity_weight: Amount = 0.2  # Our choice: weight of the velocity within the L1 loss.
     refined_class_weight: Amount = 4.0
-    """Weight of the second look's cross-entropy; not in the paper, see :class:`RefinementConfig`."""
+    """Weight of the second look's cross-entropy (not in the paper)."""
     refined_box_weight: Amount = 0.5  # Weight of the second look's L1 loss.
     quality: Literal["iou", "centreness"] = "iou"
     """Target of the quality prediction, by which the score is multiplied: the rotated 3D IoU, or the distance
-    between predicted and true centre (not in the paper), see :func:`fcos_lidar_jax.losses.centreness`."""
+    between predicted and true centre (not in the paper)."""
     centreness_m: Positive = 0.75  # Distance between the centres at which the centreness is 1 / e, metres.
 
     def __post_init__(self) -> None:
@@ -184,7 +184,7 @@ class InferenceConfig(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class RefinementConfig(Checked):
-    """A second look at the points of the best boxes (not in the paper), see :mod:`fcos_lidar_jax.refinement`."""
+    """A second look at the points of the best boxes (not in the paper)."""
 
     num_boxes: Count = 200  # Best boxes of a cloud that are looked at; others are dropped.
     num_points: Count = 64  # Maximum number of points per box.

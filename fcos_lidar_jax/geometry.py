@@ -1,4 +1,4 @@
-"""Angles, rotations and points in boxes, with finite values and gradients for every input."""
+"""Angles, rotations and points in boxes, with finite values and gradients also at the origin."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -93,8 +93,8 @@ def wrap_angle(angle: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarr
     """
     xp = jnp if isinstance(angle, Array) else np
     wrapped = angle - 2 * np.pi * xp.floor((angle + np.pi) / (2 * np.pi))
-    # Rounding can give pi itself, which the interval excludes.
-    return xp.where(wrapped >= np.pi, -np.pi, wrapped)
+    # Rounding can give pi itself, which the interval excludes, or less than -pi.
+    return xp.where((wrapped >= np.pi) | (wrapped < -np.pi), -np.pi, wrapped)
 
 
 def rotation_matrix(rotation: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n 3 3"]:

@@ -77,7 +77,7 @@ def image_cells(
     sector or more than half a row outside the field of view get the sentinel cell ``num_rows * num_columns``.
 
     Returns:
-        row-major cells, and (range, azimuth, inclination) relative to the sensor, finite everywhere.
+        row-major cells, and (range, azimuth, inclination) relative to the sensor, finite for points in the image.
 
     >>> two = Sensor("two", (0.1, 0.0), 8)
     >>> image_cells(jnp.array([[-5.0, 1e-3, 0, 0, 0]]), jnp.ones(1, bool), two)[0].tolist()

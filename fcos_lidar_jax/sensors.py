@@ -11,7 +11,8 @@ import numpy as np
 from fcos_lidar_jax.fields import Bounds, Checked, check, check_name, from_json
 from fcos_lidar_jax.files import read_json
 
-_MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
+_MAX_NUMBER = 1e9  # Keeps squares in float32 finite.
+_ROUNDING_RAD = 1e-9  # of the ends of a whole turn
 _SAME_HEADING_RAD = 1e-3  # headings typed with few digits are the same
 # Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.
 _MAX_ROWS = 4096
@@ -59,7 +60,7 @@ class Sensor(Checked):
         expected = f"2 to {_MAX_ROWS} strictly decreasing values, the highest beam first"
         check(decreasing, "inclinations_rad", table, expected)
         if ends is not None:
-            within = abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
+            within = abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi + _ROUNDING_RAD
             expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
             check(within, "azimuth_limits_rad", ends, expected)
 

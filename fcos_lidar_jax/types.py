@@ -145,7 +145,7 @@ class Detections:
     """Final boxes, best first, padded to a fixed count."""
 
     boxes: Float32[Array, "*b d 9"]  # Boxes, see the module docstring; zero where invalid.
-    scores: Float32[Array, "*b d"]  # Class probability times predicted IoU; zero where invalid.
+    scores: Float32[Array, "*b d"]  # Of class and IoU branches, or of the second look; zero where invalid.
     labels: Int32[Array, "*b d"]  # Class index; zero where invalid.
     valid: Bool[Array, "*b d"]  # False for padding.
     num_dropped: Int32[Array, "*b"]  # See :class:`RangeImage`.

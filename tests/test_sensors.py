@@ -70,6 +70,14 @@ def test_sensors_survive_a_round_trip_through_files(tmp_path, name):
     assert load_sensor(path) == PRESETS[name] == load_sensor(name)
 
 
+@pytest.mark.parametrize("middle", np.linspace(-4, 4, 23))
+def test_a_sector_can_be_a_whole_turn(middle):
+    whole = sector(TINY, middle, TINY.num_columns)
+    assert whole.column_rad == pytest.approx(TINY.column_rad)
+    moved = in_frame_of(whole, dataclasses.replace(TINY, forward_rad=math.remainder(middle - 1, 2 * math.pi)))
+    assert moved.column_rad == pytest.approx(TINY.column_rad)
+
+
 @pytest.mark.parametrize("middle", [math.pi / 2, -math.pi, 7.0])
 def test_a_sector_keeps_the_column_width(middle):
     part = sector(TINY, middle, 64)

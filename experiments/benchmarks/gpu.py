@@ -5,10 +5,11 @@
     python -m experiments.benchmarks.gpu --out FOLDER --parts detection training
     python -m experiments.benchmarks.gpu --out FOLDER --toy  # small networks and few repeats, to try it on a CPU
 
-A part is a JSON file with one record per row, and the rows come in the order of their worth. Each row runs in a
-process of its own, so that its memory is its own and a crash costs nothing else. A row that is in the file is not
-repeated, unless it failed; failed rows come last. No row starts that could take longer than what is left of
-``--limit-s``. ``FOLDER/work`` has the logs of the rows, compiled programs, and the frames and runs of ``scores``.
+A part is a JSON file with one record per row, with its hardware and revision, and the rows come in the order of
+their worth. Each row runs in a process of its own, so that its memory is its own and a crash costs nothing else. A
+row that is in the file is not repeated, unless it failed or lacked torch; such rows come last. No row starts that
+could take longer than what is left of ``--limit-s``. ``FOLDER/work`` has the logs of the rows, compiled programs,
+and the frames and runs of ``scores``.
 
 - ``detection``: the paper's preset from points to boxes by stage, for one cloud.
 - ``training``: its training step, with the largest memory of the process, and trainings fed from sweep files.
@@ -79,7 +80,7 @@ class Args:
     out: Path  # Folder of the JSON files; with the same folder, the command continues.
     parts: tuple[Part, ...] = ()  # Which to measure; default: all.
     toy: bool = False  # Small networks and few repeats, to try the script on a CPU.
-    limit_s: float = 540  # Time limit of the command, seconds.
+    limit_s: float = 540  # Time limit of the command in seconds, three times as long for a toy.
     torch_python: Path = Path(sys.executable)  # Interpreter that has torch.
 
     def repeats(self, number: int) -> int:
@@ -149,7 +150,7 @@ def beside_torch(args: Args, *, precision: Precision, compiled: bool) -> dict[st
     version = [args.torch_python, "-c", "import torch; print(torch.__version__)"]
     found = subprocess.run(version, capture_output=True, text=True, check=False)
     if found.returncode:
-        return {"torch": "no torch"}
+        return {"missing": f"torch in {args.torch_python}"}
     device = "cuda" if jax.devices()[0].platform == "gpu" else "cpu"
     options: dict[str, Any] = {"python": args.torch_python, "precision": set_precision(precision)}
     options |= {"DEVICE": device, "AUTOCAST": int(precision == "bfloat16"), "COMPILE": int(compiled)}
@@ -239,10 +240,10 @@ def stored(args: Args, part: str) -> dict[str, Any]:
     return record
 
 
-def keep(args: Args, part: str, name: str, row: dict[str, Any], where: dict[str, Any]) -> None:
-    """Write a row to the file of its part, and where it was measured."""
+def keep(args: Args, part: str, name: str, row: dict[str, Any]) -> None:
+    """Write a row to the file of its part."""
     record = stored(args, part)
-    whole = {**record, **where, "rows": {**record["rows"], name: row}}
+    whole = {**record, "rows": {**record["rows"], name: row}}
     atomic_write(args.out / f"{part}.json", compact_json(whole) + "\n")
 
 
@@ -260,7 +261,7 @@ def in_process(args: Args, part: str, name: str, measure: Callable[[Args], dict[
     began = time.monotonic()
     row = measure(args)
     row |= {"peak_memory_gib": peak_memory_gib(), "seconds": round(time.monotonic() - began, 1)}
-    keep(args, part, name, row, hardware())
+    keep(args, part, name, row | hardware())
 
 
 def run_row(args: Args, part: str, name: str, row: Row) -> dict[str, Any]:
@@ -279,27 +280,31 @@ def run_row(args: Args, part: str, name: str, row: Row) -> dict[str, Any]:
             if process.is_alive():
                 end()
                 process.join(_GRACE_S)
-    if process.exitcode or late:
+    if process.exitcode:  # a row that ended just after its limit has none
         said = log.read_text(encoding="utf-8", errors="replace").split("\n")
         last = next((line for line in reversed(said) if line.strip()), "nothing said")
         reason = f"not finished after {row.limit_s} s" if late else f"exit code {process.exitcode}: {last[-300:]}"
-        keep(args, part, name, {"failed": reason}, {})
+        keep(args, part, name, {"failed": reason})
     return stored(args, part)["rows"][name]
 
 
 def measure(args: Args) -> None:
     """Measure the rows that are not in the files yet, as long as there is time."""
+    longest = 2 * _GRACE_S + max(row.limit_s for part in args.parts or PARTS for row in PARTS[part].values())
+    if args.limit_s < longest:
+        raise ValueError(f"--limit-s: got {args.limit_s:g}, expected at least {longest}, for the longest row")
     began, todo, left, failed = time.monotonic(), [], [], []
+    factor = 3 if args.toy else 1
     for part in args.parts or PARTS:
         rows = stored(args, part)["rows"]
         for name, row in PARTS[part].items():
-            if name in rows and "failed" not in rows[name]:
+            if name in rows and not {"failed", "missing"} & rows[name].keys():
                 print(f"{part}, {name}: already in {args.out / part}.json", flush=True)
             else:
                 todo.append((name in rows, part, name, row))
     for _, part, name, row in sorted(todo, key=lambda one: one[0]):
-        row = row._replace(limit_s=3 * row.limit_s) if args.toy else row
-        if time.monotonic() - began + row.limit_s > args.limit_s:
+        row = row._replace(limit_s=factor * row.limit_s)
+        if time.monotonic() - began + row.limit_s + 2 * _GRACE_S > factor * args.limit_s:
             left.append(f"{part}, {name}")
             continue
         record = run_row(args, part, name, row)

@@ -17,7 +17,7 @@ from experiments.paper_tables.cells import Cell
 from experiments.paper_tables.grid import run_cells
 from experiments.paper_tables.scales import NuScenesLayout, Scale, Simulated, quarter, smoke
 from experiments.script import compact_json, markdown_table
-from experiments.statistics import MIN_SEEDS, interval, seeds_needed
+from experiments.statistics import gain, interval, seeds_needed
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
 
@@ -186,7 +186,7 @@ def _cells(table: Table, scale: Scale, seeds: tuple[int, ...], results: Path, ar
 
 
 def _row_record(table: Table, row: Row, cells: dict[str, list[Cell]]) -> dict[str, Any]:
-    """Scores of a row, differences to its reference per seed, and the paper's scores."""
+    """Scores of a row, differences to its reference, and the paper's scores."""
     reference = table.reference_of(row)
     record: dict[str, Any] = {"label": row.label, "reference": reference.label}
     record |= {"paper": table.paper_rows.get(row.paper, {}), "paper_difference": table.paper_difference(row)}
@@ -196,17 +196,19 @@ def _row_record(table: Table, row: Row, cells: dict[str, list[Cell]]) -> dict[st
         record["diverged"] = [f"seed {cell['seed']}: {cell['diverged']}" for cell in own if "diverged" in cell]
         for s in SCORES:
             record[s] = _summary([100 * cell[s] for cell in scores if cell])
-            pairs = [(cell, other) for cell, other in zip(scores, base, strict=True) if cell and other]
-            gains = [100 * (cell[s] - other[s]) for cell, other in pairs]
-            record[f"{s}_difference"] = _summary(gains)
-            if row is not reference and len(gains) >= MIN_SEEDS:
-                power = {"deviation": float(np.std(gains, ddof=1)), "seeds": seeds_needed(gains)}
-                record[f"{s}_difference"] |= power
+            arms = [[100 * cell[s] for cell in row if cell] for row in (scores, base)]
+            record[f"{s}_difference"] = _difference(*arms) if all(arms) and row is not reference else None
     return record
 
 
 def _summary(values: list[float]) -> dict[str, Any] | None:
     return {"mean": sum(values) / len(values), "interval": interval(values)} if values else None
+
+
+def _difference(own: list[float], base: list[float]) -> dict[str, Any]:
+    seeds = seeds_needed(own, base)
+    known = {"mean": float(np.mean(own) - np.mean(base)), "interval": gain(own, base)}
+    return known if seeds == "-" else known | {"seeds": seeds}
 
 
 def as_markdown(table: Table, record: dict[str, Any]) -> str:
@@ -232,7 +234,7 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         rows.append(cells)
     lines += markdown_table([*header, *extra], rows)
-    drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
+    drawn = "; 95 % intervals of Student's t, of differences Welch's" if len(record["seeds"]) > 1 else ""
     references = " or ".join(dict.fromkeys(f'"{row["reference"]}"' for row in record["rows"]))
     lines += ["", f"Differences are to {references}{drawn}.", *_notes(record), ""]
     lines += [f"{row['label']}: {line}" for row in record["rows"] for line in row.get("diverged", ())]
@@ -245,10 +247,10 @@ def _notes(record: dict[str, Any]) -> Iterator[str]:
     """Seeds that each difference would need, and warnings."""
     for s in SCORES:
         differences = {row["label"]: row.get(f"{s}_difference") or {} for row in record["rows"]}
-        shown = [f"{n}: {d['seeds']} ({d['deviation']:.2f})" for n, d in differences.items() if "seeds" in d]
+        shown = [f"{n}: {d['seeds']}" for n, d in differences.items() if "seeds" in d]
         if shown:
-            assumed = "if the mean and the deviation (in brackets) of the differences stay"
-            yield f"Seeds with which the interval of {s} would exclude zero, {assumed}: {'; '.join(shown)}."
+            stay = "if means and deviations stay"
+            yield f"Seeds with which the interval of {s} would exclude zero, {stay}: {'; '.join(shown)}."
     if record["scale"] == "smoke":
         yield "At this scale the scores mean nothing: they only show that the rows run."
     if len(record["seeds"]) == 2:

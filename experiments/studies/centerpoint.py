@@ -32,6 +32,7 @@ from experiments.changes import FROZEN_LOOK, as_centerpoint, change
 from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
 from experiments.runs import training_steps
 from experiments.script import run_script
+from experiments.statistics import gain
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector, count_parameters
@@ -100,16 +101,19 @@ def equal_time(record: dict[str, Any]) -> Iterator[str]:
         if own and peer:
             ratio = columns[label]["training step, ms"] / columns[name]["training step, ms"]
             seen = min(ratio * own[0][-1, 0], peer[0][-1, 0])
-            ends, theirs = [curve[-1, 1] for curve in own], [np.interp(seen, *curve.T) for curve in peer]
+            ends = [100 * curve[-1, 1] for curve in own]
+            theirs = [100 * float(np.interp(seen, *curve.T)) for curve in peer]
+            bounds = gain(theirs, ends)
+            lead = ", {:+.1f} [{:+.1f}, {:+.1f}]".format(*bounds) if bounds else ""
             yield (
                 f"{label}: a training step takes {ratio:.2f} of the time of {name}. mAP on the frames of the "
-                f"curves: {_percent(ends)} at the end; {name} after as much time, {seen:.0f} samples: "
-                f"{_percent(theirs)}."
+                f"curves: {_listed(ends)} at the end; {name} after as much time, {seen:.0f} samples: "
+                f"{_listed(theirs)}{lead}."
             )
 
 
-def _percent(scores: list[float]) -> str:
-    return ", ".join(f"{100 * score:.1f}" for score in scores)
+def _listed(scores: list[float]) -> str:
+    return ", ".join(f"{score:.1f}" for score in scores)
 
 
 def make_table(*, second_look: bool = False) -> Table:

@@ -35,7 +35,7 @@ from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, markdown_table, run_script, save
 from experiments.second_look import USES, look_again, look_config
-from experiments.statistics import interval
+from experiments.statistics import gain
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -179,7 +179,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     >>> rows = [{"trial": n, "steps": 9, "seed": s, "mAP": m + 0.01 * s, "step_s": 0.3, "parameters": 7}
     ...         for n, m in (("base", 0.1), ("wide", 0.2)) for s in (0, 1)]
     >>> print(table(rows).splitlines()[-1])
-    | wide | 9 | 0.2000, 0.2100 | 0.2050 | +0.1000 [+0.1000, +0.1000] | 1.95 |  | 0.30 | 7 |
+    | wide | 9 | 0.2000, 0.2100 | 0.2050 | +0.1000 [+0.0696, +0.1304] | 1.95 |  | 0.30 | 7 |
     """
     header = ["trial", "steps", "mAP by seed", "mean", "minus base, 95 %", "times base", "minus CenterPoint, 95 %"]
     lines = []
@@ -200,8 +200,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def _difference(own: dict[int, float], other: dict[int, float]) -> str:
-    """Mean and interval of the differences of equal seeds; empty for fewer than two."""
-    bounds = interval([own[s] - other[s] for s in sorted(own.keys() & other.keys())])
+    """Difference of the means and its interval; empty for fewer than two seeds of each."""
+    bounds = gain([*own.values()], [*other.values()])
     return "{:+.4f} [{:+.4f}, {:+.4f}]".format(*bounds) if bounds else ""
 
 

@@ -5,12 +5,13 @@ import enum
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NoReturn, get_type_hints
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.folder import belongs_to_own_data
 from fcos_lidar_jax.data.point_files import ENDINGS
+from fcos_lidar_jax.data.ros_bags import BAG_ENDINGS
 from fcos_lidar_jax.fields import Bounds
 from fcos_lidar_jax.files import check_writable, import_extra, local_path
 
@@ -99,9 +100,7 @@ def _check_rules(name: str, options: dict[str, _Option]) -> None:
             case Bounds() if option.value is not None and not rule.hold(option.value):
                 expected = str(rule)
             case Or(other) if not option.is_given and not options[other].is_given:
-                line = f"{option_name(name)}: got none, expected one, or {option_name(other)}"
-                print(f"fcos-lidar: error: {line}", file=sys.stderr)
-                sys.exit(2)  # as for options that are always required
+                exit_without(option_name(name), option_name(other))
             case Needs(other, value) if option.is_given and not _has(options[other], value):
                 expected = f"only with {option_name(other)} {value}".rstrip()
             case Excludes(others, why) if option.is_given and any(options[other].is_given for other in others):
@@ -114,6 +113,12 @@ def _check_rules(name: str, options: dict[str, _Option]) -> None:
 
 def _has(option: _Option, value: str) -> bool:
     return option.value == value if value else option.is_given
+
+
+def exit_without(option: str, other: str) -> NoReturn:
+    """Exit like for a missing option that is always required."""
+    print(f"fcos-lidar: error: {option}: got none, expected one, or {other}", file=sys.stderr)
+    sys.exit(2)
 
 
 def option_name(field: str) -> str:
@@ -134,8 +139,10 @@ def _check_outputs(options: dict[str, _Option]) -> None:
                 check_writable(out / ".lock")
             else:
                 check_out_file(option_name(name), out, keep)
-                if option.output is not Output.CLOUD and out.is_file() and out.name.lower().endswith(ENDINGS):
-                    raise ValueError(f"{option_name(name)}: {out}: found a point file, expected another one")
+                recorded = out.is_file() and out.name.lower().endswith((*ENDINGS, *BAG_ENDINGS))
+                if option.output is not Output.CLOUD and recorded:
+                    found = "found a point file or recording"
+                    raise ValueError(f"{option_name(name)}: {out}: {found}, expected another one")
             keep.append(out)
 
 

@@ -29,7 +29,7 @@ _COMMANDS = {
     "prepare": (prepare.Prepare, prepare.run, "extract objects for copy-paste; index nuScenes"),
     "train": (train.Train, train.run, "train a detector, or resume a run"),
     "evaluate": (evaluate.Evaluate, evaluate.run, "write metrics, a report and a page of frames"),
-    "detect": (detect.Detect, detect.run, "write the boxes of point files"),
+    "detect": (detect.Detect, detect.run, "write the boxes of point files, or of a recording"),
     "stream": (stream.Stream, stream.run, "write the boxes of a drive, sweep by sweep"),
     "project": (project.Project, project.run, "write the range image of a point file"),
     "export": (export.Export, export.run, "export a detector to a single file, or to ONNX"),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from fcos_lidar_jax.cli import options
+from fcos_lidar_jax.cli.checks import exit_without
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
@@ -44,7 +45,7 @@ class DataOptions:
     splits: Annotated[Path | None, option("FILE", default="the splits of the data")] = None
     """JSON file with custom splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
     class_map: Annotated[str | None, option("NAME|FILE")] = None
-    """Rename classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes, or a JSON file:
+    """Rename classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes and simulated frames, or a JSON file:
     {name in the data: new name, or null to leave out its objects}."""
     full_turn: options.FullTurn = False
     intensity_scale: options.IntensityScale = None
@@ -53,6 +54,8 @@ class DataOptions:
 
     @functools.cached_property
     def data_set(self) -> DataSet:
+        if self.data_root is None and self.format is None:
+            exit_without("--data-root", "--format simulated")
         return find_data_set(self.data_root, self.format, self.version)
 
     def split(self, purpose: Literal["train", "val"], given: str | None, *, required: bool = True) -> str | None:

@@ -48,7 +48,9 @@ class Detect:
     removed since; a recording starts again. A file that is given twice is processed once.
     """
 
-    files: tyro.conf.Positional[Annotated[tuple[Path, ...], Or("sweeps"), option("INPUT", text=_INPUT)]]
+    files: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], Or("sweeps"), option("INPUT", default="the list of --sweeps", text=_INPUT)]
+    ]
     checkpoint: options.Detector
     out: Annotated[Path, Output.RESULT, option("FILE")]  # File to write.
     output_format: options.OutputFormat = "json"

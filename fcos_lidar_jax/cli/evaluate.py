@@ -60,8 +60,9 @@ class Evaluate:
 
     The command writes metrics_summary.json, curves.json, report.html, frames.html (the worst and the best frames),
     and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI, it also writes
-    metrics_kitti.json and result files in results_kitti. After Ctrl-C or a kill, the same command resumes and
-    repeats at most one batch, and clouds without usable points.
+    metrics_kitti.json and result files in results_kitti. After Ctrl-C or a kill, the same command resumes
+    the detection and repeats at most one batch, and clouds without usable points. Once they are written, --results
+    evaluates the detections again.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
@@ -70,7 +71,9 @@ class Evaluate:
     """Split to evaluate on."""
     samples: Annotated[str | None, option("FIRST:LAST,...", default="all")] = None
     """Ranges of the split's frames, LAST excluded."""
-    checkpoint: Annotated[Path | None, Or("results"), option("C", text=DETECTOR_TEXT)] = None
+    checkpoint: Annotated[
+        Path | None, Or("results"), option("C", default="none, with --results", text=DETECTOR_TEXT)
+    ] = None
     results: Annotated[Path | None, _NO_DETECTION, option("FILE|DIR")] = None
     """Results to evaluate: an official results file, detections.json with the --checkpoint it came from,
     or a folder of KITTI result files, one for each frame of the split."""

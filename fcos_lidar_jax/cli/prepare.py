@@ -32,7 +32,7 @@ class Prepare:
 
     Objects and index are verified whenever they are opened, and can be rebuilt. A training that runs meanwhile
     stops if its objects change, and resumes after they are prepared as before. After Ctrl-C or a kill, the same
-    command resumes and repeats at most one scene of objects.
+    command resumes and repeats at most one scene of objects per worker.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.

@@ -53,7 +53,9 @@ class Stream:
     out: Annotated[Path, Output.RESULT, option("FILE.jsonl")]  # File to write; an earlier file is replaced.
     output_format: options.OutputFormat = "json"
     calibration: options.Calibration = None
-    source: tyro.conf.Positional[Annotated[Path | None, Or("data_root"), option("SOURCE")]] = None
+    source: tyro.conf.Positional[
+        Annotated[Path | None, Or("data_root"), option("SOURCE", default="the scene of --data-root")]
+    ] = None
     """Folder of point files, one per sweep; ROS 1 (.bag) or ROS 2 (folder, .mcap, .db3) recording; KITTI raw
     drive; or Argoverse 2 log."""
     poses: Annotated[
@@ -126,7 +128,7 @@ def run(args: Stream, *, in_lines: bool = True) -> None:
     with contextlib.ExitStack() as sinks, _Timing() as timing:
         sinks.callback(_tell_notes, drive.notes)  # also if the source fails
         add = sinks.enter_context(open_sinks(args, classes, aligned.data, **views))
-        with closing_at_failure(sinks, notes):
+        with closing_at_failure(sinks, notes) if in_lines else contextlib.nullcontext():
             for found in detect_stream(_in_order(drive, timing), detector, **how):
                 timing.begin("writing")
                 assert found.sweep is not None

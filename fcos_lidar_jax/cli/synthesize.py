@@ -22,8 +22,9 @@ class Synthesize:
     write them in the official nuScenes layout.
 
     The same options give the same bytes, and a scene does not depend on the number of scenes. After Ctrl-C or a
-    kill, the same command resumes and repeats one scene. The last fifth of the scenes is the split val, the rest
-    is train. The official devkit reserves these names; there they are called synthetic_val and synthetic_train.
+    kill, the same command resumes and repeats one scene per worker. The last fifth of the scenes is the split val,
+    the rest is train. For the official devkit, which reserves these names, they are synthetic_val and
+    synthetic_train.
     """
 
     out: Annotated[Path, Output.FOLDER, option("DIR")]

@@ -25,7 +25,7 @@ def is_kitti_raw(folder: Path) -> bool:
 
 
 def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINTS) -> Drive:
-    """The sweeps of a recording, synchronised (``_sync``) or not.
+    """The sweeps of a synchronised recording (``_sync``).
 
     Reads ``velodyne_points/data/N.bin``, line N of ``velodyne_points/timestamps.txt``, ``oxts/data/N.txt``, and
     ``calib_imu_to_velo.txt`` in the folder or its parent. Positions are in a Mercator projection scaled at the

@@ -30,7 +30,8 @@ from fcos_lidar_jax.sensors import Sensor
 _CLOUD = ("sensor_msgs/msg/PointCloud2",)
 _POSE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_ENDINGS = (".bag", ".mcap", ".db3")
+BAG_ENDINGS = (".bag", ".mcap", ".db3")
+_LISTS = "relative_file_paths"  # in the metadata of a recording
 _MAX_LISTED = 20  # topics listed in a message
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Datatype of a field -> NumPy's type."""
@@ -40,22 +41,29 @@ _PoseAt = Callable[[str, int, str], np.ndarray]
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, a folder of them or with ``metadata.yaml``."""
-    return path.suffix in _ENDINGS or (path / "metadata.yaml").is_file() or _files(path) != [path]
+    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder of them or with their metadata."""
+    if path.suffix in BAG_ENDINGS or not path.is_dir():
+        return path.suffix in BAG_ENDINGS
+    names, text = [file.name.lower() for file in path.iterdir()], _metadata(path)
+    if any(name.endswith(ENDINGS) for name in names):
+        return _LISTS in (text or "")
+    return text is not None or any(name.endswith(BAG_ENDINGS) for name in names)
 
 
 def _files(path: Path) -> list[Path]:
     """What rosbags can open: the path, or the files of a folder whose metadata lack the format or are missing."""
     if not path.is_dir():
         return [path]
-    files, metadata = sorted(path.iterdir()), path / "metadata.yaml"
-    if metadata in files:
-        text = metadata.read_text(encoding="utf-8", errors="replace")
-        if "relative_file_paths" not in text or re.search(r"storage_identifier:\s*[\"']?\w", text):
-            return [path]
-    if any(file.name.endswith(ENDINGS) for file in files):
+    text = _metadata(path)
+    if text is not None and (_LISTS not in text or re.search(r"storage_identifier:\s*[\"']?\w", text)):
         return [path]
-    return [file for file in files if file.suffix in _ENDINGS] or [path]
+    return sorted(file for file in path.iterdir() if file.suffix in BAG_ENDINGS) or [path]
+
+
+def _metadata(folder: Path) -> str | None:
+    """The metadata of a recording in a folder; other tools write files of this name as well."""
+    file = folder / "metadata.yaml"
+    return file.read_text(encoding="utf-8", errors="replace") if file.is_file() else None
 
 
 def ros_bag_drive(

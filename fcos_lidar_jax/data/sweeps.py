@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -110,10 +110,7 @@ def read_list(path: Path) -> list[ListedSweep]:
         if sweep.timestamp_us >= newer.timestamp_us:
             expected = f"less than {newer.timestamp_us} of the entry before: the current sweep first, then by age"
             raise ValueError(f"{path}: $[{index}].timestamp_us: got {sweep.timestamp_us}, expected {expected}")
-    gap_us = (sweeps[0].timestamp_us - sweeps[-1].timestamp_us) / max(len(sweeps) - 1, 1)
-    if len(sweeps) > 1 and not _GAP_US[0] <= gap_us <= _GAP_US[1]:
-        expected = f"microseconds, {_GAP_US[0]} to {_GAP_US[1]} from sweep to sweep"
-        raise ValueError(f"{path}: timestamp_us: got {gap_us:g} on average, expected {expected}")
+    check_gap(path, sweeps)
     return sweeps
 
 
@@ -126,6 +123,15 @@ def read_entries(path: Path) -> list[ListedSweep]:
             expected = "a rotation in the upper left 3x3, and 0, 0, 0, 1 as the last row"
             raise ValueError(f"{where}.sensor_to_world: got {pose.tolist()}, expected {expected}")
     return sweeps
+
+
+def check_gap(path: Path, sweeps: Sequence[ListedSweep]) -> None:
+    """Refuse a list whose times are not microseconds."""
+    times = [sweep.timestamp_us for sweep in sweeps]
+    gap_us = (max(times) - min(times)) / max(len(sweeps) - 1, 1)
+    if len(sweeps) > 1 and not _GAP_US[0] <= gap_us <= _GAP_US[1]:
+        expected = f"microseconds, {_GAP_US[0]} to {_GAP_US[1]} from sweep to sweep"
+        raise ValueError(f"{path}: timestamp_us: got {gap_us:g} on average, expected {expected}")
 
 
 def is_rotation(matrix: np.ndarray) -> bool:

@@ -11,6 +11,7 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.folder import sensor_file
 from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
+from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor, in_frame_of, turn_between
@@ -58,6 +59,7 @@ class Alignment:
             return detections
         boxes, valid = np.array(detections.boxes), np.asarray(detections.valid)
         boxes[valid] = to_world(boxes[valid], pose)
+        boxes[valid, 6] = wrap_angle(boxes[valid, 6])  # rounding to float32 can give pi
         return dataclasses.replace(detections, boxes=boxes)
 
     def tell_notes(self) -> None:

@@ -57,7 +57,7 @@ class CloudDetector(abc.ABC):
     @property
     @abc.abstractmethod
     def fingerprint(self) -> str:
-        """Fingerprint of program and weights."""
+        """Fingerprint of the weights and, in an exported file, of the program."""
 
     @abc.abstractmethod
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:

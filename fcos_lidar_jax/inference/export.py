@@ -48,7 +48,7 @@ class ExportedDetector(CloudDetector):
 
     @property
     def fingerprint(self) -> str:
-        return self.record["weights"]["blake2b"] + " exported"
+        return f"{self.record['weights']['blake2b']} in {self.record['program']['blake2b']}"
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         takes = self.record["batch"]

@@ -59,7 +59,8 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
         ]
         candidates = np.concatenate([np.zeros(0, np.int64), *sampled])
         rows = candidates[_without_overlap(boxes[candidates], frame.boxes)]
-        clouds = [objects.points(row)[: pasted[row]] for row in rows]
+        columns = frame.points.shape[1]  # a sensor without rows of lasers has no use for their numbers
+        clouds = [objects.points(row)[: pasted[row], :columns] for row in rows]
         points = np.concatenate([frame.points[:0], *clouds])
         inside = np.zeros(len(frame.points), bool)
         for covered in points_in_boxes(frame.points, boxes[rows]):

@@ -103,7 +103,8 @@ def _order(points: Array, usable: Array) -> Array:
 
 def _hash(points: Array, seed: int) -> Array:
     """A 32-bit hash of the bits of each row; both zeros are the same."""
-    bits = lax.bitcast_convert_type(points + 0.0, jnp.uint32)
+    bits = lax.bitcast_convert_type(points, jnp.uint32)
+    bits = jnp.where(bits == jnp.uint32(1 << 31), jnp.uint32(0), bits)  # XLA would remove the addition of 0.0
     mixed = jnp.full(points.shape[0], seed, jnp.uint32)
     for column in range(bits.shape[1]):
         mixed = (mixed ^ bits[:, column]) * jnp.uint32(0x85EBCA6B)

@@ -76,6 +76,8 @@ def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> 
         check_same(checksum(f"{first} {pending}".encode()), "checkpoint to resume from")
         if first == spec.steps and not pending:
             tell(f"{spec.out}: the run is complete, with {first} steps")
+            if is_main_process:
+                draw_metrics(spec.out)  # unless the run was ended before
             return start
         log = MetricsLog(spec.out, first_step=first) if is_main_process else None
         if log is not None:

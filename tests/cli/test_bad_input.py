@@ -90,7 +90,6 @@ stream HOME/a.bag --odometry tf --poses HOME/poses.json => --poses: got .*, expe
 stream --data-root HOME => --data-root: got .*, expected only with --scene$
 stream --data-root HOME --scene a --intensity-scale 9 => --intensity-scale: got 9.0, expected none with
 stream --data-root HOME/data --scene scene-0 --output-format nuscenes => expected --keyframes with --data-root
-evaluate --results HOME/truth.json => data root: missing, expected the folder of a data set
 evaluate --checkpoint x --ground-truth HOME/truth.json => --ground-truth: .* expected none with --checkpoint
 evaluate --results x --ground-truth HOME/truth.json --version v1 => --ground-truth: .* none with --version
 evaluate --results x --ground-truth HOME/truth.json --batch-size 2 => --results: .* none with --batch-size

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, page_content
+from commands import assert_one_line_error, command, cut, page_content
 from made_argoverse2 import STEP_NS, make_log
 from made_bags import structured, write_recording
 from scipy.spatial.transform import Rotation
@@ -244,7 +244,7 @@ def test_sweeps_out_of_order_are_kept_without_poses_and_skipped_with_them(home, 
         assert note.format(1, home / listed[2]["file"], "skipped") in capsys.readouterr().err
 
 
-def test_a_log_of_argoverse2_is_a_source(home, tmp_path):
+def test_a_log_of_argoverse2_is_a_source(home, tmp_path, capsys):
     log = make_log(tmp_path / "log", 0, sweeps=4, sensor=dataclasses.replace(TINY, row_source="laser"))
     lines = stream(home, tmp_path / "a.jsonl", log)
     frames = Argoverse2Frames(log)
@@ -253,4 +253,9 @@ def test_a_log_of_argoverse2_is_a_source(home, tmp_path):
     for index, line in enumerate(lines):
         assert line["sensor_to_world"] == frames.pose(index).tolist()
     command("detect", log, "--checkpoint", home / "checkpoint", "--out", tmp_path / "a.json")
-    assert json.loads((tmp_path / "a.json").read_text()) == {"files": lines}
+    found = (tmp_path / "a.json").read_text()
+    assert json.loads(found) == {"files": lines}
+    cut(sorted((log / "sensors" / "lidar").iterdir())[2], 100)
+    args = ["detect", str(log), "--checkpoint", str(home / "checkpoint"), "--out", str(tmp_path / "a.json")]
+    assert_one_line_error(capsys, args, "feather: not a readable .feather file: ")
+    assert (tmp_path / "a.json").read_text() == found

@@ -128,7 +128,8 @@ def test_folders_of_files_are_read_in_the_order_of_recording(tmp_path, form):
     sweeps = list(ros_bag_drive(folder, TINY).sweeps)
     assert [sweep.time_us for sweep in sweeps] == [*range(6)]
     assert [sweep.name for sweep in sweeps] == [f"{folder}: /p: message {i}" for i in range(6)]
-    (folder / "000.pcd").touch()
+    (folder / "000.PCD").touch()
+    (folder / "metadata.yaml").write_text("of: another tool")
     assert not is_ros_bag(folder)
 
 

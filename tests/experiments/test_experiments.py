@@ -48,17 +48,19 @@ def test_the_examples_in_the_docstrings_hold(name):
     assert result.failed == 0
 
 
-def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_table, capsys):
+def test_tables_show_differences_with_intervals_beside_the_papers(tmp_path, train_table, capsys):
     rows = {row["label"]: row for row in train_table(TABLES["table1"], seeds=(0, 1))["rows"]}
     multi, single = rows["multi, 5 rounds"], rows["single, 5 rounds"]
-    np.testing.assert_allclose(multi["mAP_difference"]["interval"], [40.0] * 3)
+    # Both rows have the variance 0.5, so Welch's t has 2 degrees of freedom: t(0.975, 2) = 4.3027.
+    half = 4.3027 * np.sqrt(0.5 / 2 + 0.5 / 2)
+    np.testing.assert_allclose(multi["mAP_difference"]["interval"], [40, 40 - half, 40 + half], atol=1e-4)
     assert multi["paper_difference"] == {"mAP": 2.06, "NDS": 1.88}
     assert single["reference"] == "single, 1 round"
     assert single["paper_difference"] == {"mAP": 0.28, "NDS": 1.88}
     assert multi["mAP_difference"]["mean"] == single["mAP_difference"]["mean"] == pytest.approx(40.0)
     text = (tmp_path / "smoke" / "table1.md").read_text()
     assert text in capsys.readouterr().out
-    assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+40.00, +40.00] | 57.08 | +2.06 |" in text
+    assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+36.96, +43.04] | 57.08 | +2.06 |" in text
     assert "| multi, 1 round | 10.50 [4.15, 16.85] | - | 55.02 | - |" in text, "no difference to itself"
     assert "would exclude zero" not in text, "two seeds do not tell how many are needed"
 
@@ -71,7 +73,7 @@ def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_ta
     assert rows["multi, 1 round"]["mAP"]["mean"] == pytest.approx(11.5)
     assert rows["multi, 3 rounds"]["mAP"] == {"mean": pytest.approx(32.0), "interval": None}
     assert rows["multi, 5 rounds"]["mAP"]["mean"] == pytest.approx(51.0)
-    assert rows["multi, 5 rounds"]["mAP_difference"]["mean"] == pytest.approx(40.0)
+    assert rows["multi, 5 rounds"]["mAP_difference"]["mean"] == pytest.approx(51.0 - 11.5)
     said = [f"seed {seed}: step 7: loss/l1 is not finite" for seed in (0, 1)]
     assert rows["multi, 3 rounds"]["diverged"] == said
     assert f"multi, 3 rounds: {said[1]}" in (tmp_path / "smoke" / "table1.md").read_text()

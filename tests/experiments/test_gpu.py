@@ -15,14 +15,15 @@ def crashes(args):
 
 
 def test_the_same_command_continues_with_what_is_left(tmp_path, monkeypatch, capsys):
-    rows = {name: Row(limit_s, crashes) for name, limit_s in (("bad", 10), ("long", 600), ("good", 10))}
+    rows = {name: Row(limit_s, crashes) for name, limit_s in (("bad", 10), ("long", 500), ("good", 10))}
     monkeypatch.setattr(gpu, "PARTS", {"detection": rows, "torch": {"other": Row(10, crashes)}})
     reached = []
 
     def run_row(args, part, name, row):
-        record = {"failed": "cannot"} if name == "bad" and "bad" not in reached else {"ms": 1}
+        first = {"bad": {"failed": "cannot"}, "other": {"missing": "torch in python"}}
+        record = {"ms": 1} if name in reached else first.get(name, {"ms": 1})
         reached.append(name)
-        gpu.keep(args, part, name, record, {})
+        gpu.keep(args, part, name, record)
         return record
 
     monkeypatch.setattr(gpu, "run_row", run_row)
@@ -37,10 +38,14 @@ def test_the_same_command_continues_with_what_is_left(tmp_path, monkeypatch, cap
     assert f"detection, good: already in {file}\n" in capsys.readouterr().out
     measure(args)
     assert len(reached) == 5
+    measure(Args(out=tmp_path, limit_s=700))
+    assert reached[5:] == ["other"], "which lacked torch"
     rows = {name: {"ms": 1} for name in ("bad", "good", "long")}
     assert json.loads(file.read_text()) == {"toy": False, "rows": rows}
     with pytest.raises(ValueError, match=r"detection\.json: toy: found False, expected True"):
         measure(Args(out=tmp_path, toy=True))
+    with pytest.raises(ValueError, match=r"^--limit-s: got 539, expected at least 540, for the longest row"):
+        measure(Args(out=tmp_path, limit_s=539))
 
 
 @pytest.mark.slow
@@ -48,13 +53,12 @@ def test_a_row_that_crashes_or_takes_too_long_costs_only_itself(tmp_path, monkey
     rows = {"late": Row(0, crashes), "crashed": Row(600, crashes), "toy": gpu.PARTS["projection"]["rounds"]}
     monkeypatch.setattr(gpu, "PARTS", {"torch": rows})
     with pytest.raises(ValueError, match=r"^failed: torch, late; torch, crashed: see "):
-        measure(Args(out=tmp_path, parts=("torch",), toy=True, limit_s=3600))
-    record = json.loads((tmp_path / "torch.json").read_text())
-    late, crashed, toy = record["rows"].values()
+        measure(Args(out=tmp_path, parts=("torch",), toy=True, limit_s=1200))
+    late, crashed, toy = json.loads((tmp_path / "torch.json").read_text())["rows"].values()
     assert late["failed"] == "not finished after 0 s"
     assert crashed["failed"] == "exit code 3: Check failed"
     for times in (toy["single"], toy["multi"]):
         assert times["1"]["ratio"] == 1
         assert 0 < times["2"]["median_ms"] <= times["2"]["p99_ms"]
     assert toy["peak_memory_gib"] > 0
-    assert {"device", "jax", "git"} <= record.keys()
+    assert {"device", "jax", "git"} <= toy.keys()

@@ -1,6 +1,7 @@
 """The ledger says what the result files say."""
 
 import csv
+import itertools
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,9 @@ from experiments.ledger import (
     NETWORKS,
     README,
     RESULTS,
+    arms_of,
     as_markdown,
     claim_rows,
-    gains_of,
     verdict,
     with_ledger,
 )
@@ -27,6 +28,8 @@ FOLDER = RESULTS / "tables/sector"
 def test_the_document_holds_the_ledger_of_the_files():
     text, ledger = README.read_text(), as_markdown()
     assert with_ledger(text, ledger) == text
+    with pytest.raises(ValueError, match="expected the lines .* around the ledger"):
+        with_ledger(text.replace("<!-- end of", "<!-- the end of"), ledger)
     assert ledger.count("\n| priority | +") == 2
 
 
@@ -39,28 +42,28 @@ def test_velocity_adds_nothing_to_nds_as_the_ledger_says():
 
 
 @pytest.mark.parametrize(
-    ("gains", "paper", "expected"),
+    ("own", "other", "paper", "expected"),
     [
-        ([0.4, 0.5, 0.6], 0.5, "agrees"),
-        ([-0.4, -0.5, -0.6], -0.5, "agrees"),
-        ([3.0, 3.1, 3.2], 0.5, "agrees only in direction"),
-        ([-3.0, -3.1, -3.2], -0.5, "agrees only in direction"),
-        ([-3.0, -3.1, -3.2], 0.5, "disagrees"),
-        ([-0.1, 0.0, 0.1], 2.0, "disagrees"),  # no gain, and the paper's is excluded
-        ([-3.0, 0.0, 3.0], 2.0, "undecided"),
-        ([2.0], 2.0, "undecided"),
-        ([2.0, 2.01], 2.0, "undecided"),
+        ([0.4, 0.5, 0.6], [0.0, 0.0, 0.0], 0.5, "agrees"),
+        ([0.0, 0.0, 0.0], [0.4, 0.5, 0.6], -0.5, "agrees"),
+        ([4.0, 4.1, 4.2], [1.0, 1.1, 0.9], 0.5, "agrees only in direction"),
+        ([1.0, 1.1, 0.9], [4.0, 4.1, 4.2], -0.5, "agrees only in direction"),
+        ([1.0, 1.1, 0.9], [4.0, 4.1, 4.2], 0.5, "disagrees"),
+        ([1.0, 1.1, 0.9], [1.1, 0.9, 1.0], 2.0, "disagrees"),  # no gain, and the paper's is excluded
+        ([-3.0, 0.0, 3.0], [0.0, 1.0, -1.0], 2.0, "undecided"),
+        ([2.0], [0.0], 2.0, "undecided"),
+        ([2.0, 2.01, 2.02], [0.0, 0.01], 2.0, "undecided"),
     ],
 )
-def test_verdicts(gains, paper, expected):
-    assert verdict(gains, paper)[0] == expected
+def test_verdicts(own, other, paper, expected):
+    assert verdict((own, other), paper)[0] == expected
 
 
 def test_an_undecided_claim_names_the_seeds_that_would_decide():
-    # Deviation 1: t(0.975, 5) / sqrt(6) = 1.049, t(0.975, 6) / sqrt(7) = 0.925.
-    assert verdict([-0.5, 0.5, 1.5], 1.0)[1].startswith("7 seeds")
-    assert verdict([0.5, -0.5, -1.5], -1.0)[1].startswith("7 seeds")
-    assert verdict([-9.0, 0.5, 9.0], 0.01)[1].startswith("over 100 seeds")
+    # Deviation 1 of both: t(0.975, 16) sqrt(2 / 9) = 0.999, t(0.975, 14) sqrt(2 / 8) = 1.072.
+    assert verdict(([-0.5, 0.5, 1.5], [-1.0, 0.0, 1.0]), 1.0)[1] == "9 seeds"
+    assert verdict(([0.5, -0.5, -1.5], [1.0, 0.0, -1.0]), -1.0)[1] == "9 seeds"
+    assert verdict(([-9.0, 0.5, 9.0], [0.0, 0.0, 0.0]), 0.01)[1] == "over 100 seeds"
 
 
 def test_gains_are_of_the_same_network():
@@ -81,10 +84,10 @@ def test_gains_are_of_the_same_network():
     for score, network in zip((0.45, 0.7), networks, strict=True):
         name = changes_of(as_centerpoint(network(SCALE.base)), SCALE.base)
         cells[name, 0] = {"scores": {"mAP": score}}
-    cells["model.local_geometry=true, num_sweeps=1", 1] = {"scores": {"mAP": 0.9}}  # a seed without references
+    cells["model.local_geometry=true", 1] = {"diverged": "step 7"}
     gains = {
         claim.text: [
-            [round(gain) for gain in gains_of(claim, network, SCALE, cells, "mAP")]
+            [round(own - other) for own, other in itertools.product(*arms_of(claim, network, SCALE, cells, "mAP"))]
             for network in NETWORKS.values()
         ]
         for claim in CLAIMS

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.inference.onnx_program import program_graph
 from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.sensors import sector
 from fcos_lidar_jax.simulation.frames import make_frame
 
 pytestmark = pytest.mark.slow
@@ -21,14 +23,20 @@ onnx = pytest.importorskip("onnx", reason="onnx, of the extra onnx, is not insta
 onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime, of the extra onnx, is not installed")
 
 
-def tiny(config, **projection):
+def tiny(config, sensor=SENSOR, **projection):
     config = dataclasses.replace(config, projection=dataclasses.replace(config.projection, **projection))
-    return TrainedDetector(build_detector(config, SENSOR), untrained(config, SENSOR))
+    return TrainedDetector(build_detector(config, sensor), untrained(config, sensor))
+
+
+UNEVEN = tuple(angle + 0.003 * math.sin(9 * angle) for angle in SENSOR.inclinations_rad)
 
 
 DETECTORS = {
     "quickstart": lambda: load_trained("quickstart"),
     "tiny with five rounds and a second look": lambda: tiny(REFINED, num_rounds=5),
+    "tiny with a sector of uneven beams": lambda: tiny(
+        CONFIG, sector(dataclasses.replace(SENSOR, inclinations_rad=UNEVEN), 0.3, SENSOR.num_columns // 2)
+    ),
 }
 
 

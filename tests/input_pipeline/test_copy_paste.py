@@ -9,11 +9,13 @@ from refusal import refused
 from shapely import area, intersection
 from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig
-from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import MAX_SWEEPS, prepare_database
 from fcos_lidar_jax.presets import NUSCENES
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
 SPEC = CopyPasteConfig()
 TOY_LAGS = np.array([0, 0.05, 0.1], np.float32)
@@ -68,6 +70,18 @@ def test_pasted_objects_fill_up_the_classes_without_overlap(objects, seed, num_s
     pasted = paste.boxes.astype(float)
     inside = [any(oracles.inside(p, box) for box in pasted) for p in frame.points[:, :3].astype(float)]
     assert removed.tolist() == np.flatnonzero(inside).tolist()
+
+
+def test_numbers_of_lasers_are_left_out_if_the_frame_has_none(tmp_path):
+    sensor = dataclasses.replace(NUSCENES_HDL32E, row_source="laser")
+    frames = InMemoryFrames(tuple(wide(toy_frame(seed)) for seed in range(20)), sensor, NUSCENES_CLASSES)
+    found, _ = pasted_into(toy_frame(100), prepare_database(frames, tmp_path))
+    assert len(found.boxes) > 5
+    assert found.points.shape[1] == 5
+
+
+def wide(frame):
+    return dataclasses.replace(frame, points=np.pad(frame.points, ((0, 0), (0, 1))))
 
 
 def test_a_sampled_object_is_dropped_only_if_it_overlaps_another(objects):

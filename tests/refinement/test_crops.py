@@ -59,6 +59,20 @@ def test_the_choice_depends_only_on_the_points():
     np.testing.assert_array_equal(np.append(order, -1)[other.index], found.index)
 
 
+def test_both_zeros_are_the_same_under_jit():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (32, 5)).astype(np.float32)
+    points[:, 1] = 0
+    valid, boxes = jnp.ones(32, bool), jnp.array([[0, 0, 0, 4, 4, 4, 0, 0, 0]], jnp.float32)
+    signed = points.copy()
+    signed[::2, 1] = -0.0
+    points, signed = jnp.asarray(points), jnp.asarray(signed)
+    expected = crop(points, valid, boxes, num_points=4, margin_m=0.5).index
+    for find in (crop, crop_points):
+        found = find(signed, valid, boxes, num_points=4, margin_m=0.5)
+        np.testing.assert_array_equal(found.index, expected)
+
+
 def test_the_choice_is_not_biased():
     points = np.random.default_rng(0).uniform(-1, 1, (4000, 5)).astype(np.float32)
     found = crop(points, np.ones(4000, bool), np.array([[0, 0, 0, 2, 2, 2, 0.0]]), num_points=1000, margin_m=0.1)

@@ -209,6 +209,7 @@ def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished
 def test_resuming_a_finished_run_changes_nothing(finished, capsys):
     folder, state, *_ = finished
     before = contents(folder)
+    (folder / "loss.png").unlink()  # as if the run had been ended before
     assert bits(train_tiny(folder, evaluate=2, tests=TESTS, resume=True)) == bits(state)
     assert "the run is complete, with 4 steps" in capsys.readouterr().err
     assert contents(folder) == before
