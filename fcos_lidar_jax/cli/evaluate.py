@@ -34,7 +34,7 @@ from fcos_lidar_jax.inference.alignment import heading, other_rows
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
-from fcos_lidar_jax.visualization.evaluation_report import PAGE
+from fcos_lidar_jax.visualization.evaluation_report import PAGE, clear_report
 
 _TOO_HIGH = "scores on training frames are too high"
 _NO_DETECTION = Excludes(("backend", "batch_size", "yaw_deg", "distributed", "coordinator"), "nothing is detected")
@@ -146,6 +146,7 @@ def _score_kitti_results(args: Evaluate) -> None:
     assert isinstance(frames, KittiFrames)
     metrics = score_kitti(args.results, frames, of=f"split {split!r}" if split else str(frames.root))
     with folder_lock(args.out, "evaluating"):
+        clear_report(args.out)  # it may show other numbers
         atomic_write(args.out / KITTI_SUMMARY, json.dumps(metrics, indent=2))
     print(describe_kitti(metrics))
     print(f"look at {args.out / KITTI_SUMMARY}")

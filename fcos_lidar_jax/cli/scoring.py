@@ -11,7 +11,7 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.comparison import Compared, Comparison
 from fcos_lidar_jax.evaluation.examples import choose_examples
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
-from fcos_lidar_jax.evaluation.kitti_results import write_kitti
+from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, write_kitti
 from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
@@ -68,6 +68,7 @@ def write_scores(task: Task, compared: Compared, out: Path, *, bootstrap: int = 
     for line in compared.warnings:
         tell(f"warning: {line}")
     clear_report(out)  # it may show other numbers
+    (out / KITTI_SUMMARY).unlink(missing_ok=True)
     evaluation = evaluate(compared.predictions, compared.truth, task.comparison.metric)
     progress = Progress("sets", bootstrap)
     intervals = write_evaluation(out, evaluation, compared.meta, repeats=bootstrap, report=progress.show)
@@ -108,7 +109,8 @@ def write_reports(
         for each in make_examples(*source, examples.extremes, min_score=0, all_sweeps=True)
     ]
     if frames:
-        write_page(out / PAGE, frames, task.sensor, title=title, classes=evaluation.metric.classes)
+        how = {"classes": evaluation.metric.classes, "ego": task.frames is not None}
+        write_page(out / PAGE, frames, task.sensor, title=title, **how)
     write_evaluation_report(
         out,
         title=title,

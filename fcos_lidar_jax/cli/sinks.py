@@ -133,8 +133,10 @@ def _collect(frames: list[PageFrame]) -> Callable[..., None]:
 def _details(record: Record, *, tracked: bool) -> dict[str, Any]:
     """The name and, in a drive, time, pose and track numbers, as pages and recordings take them."""
     details: dict[str, Any] = {"name": Path(record["file"]).name}
+    if (time_us := record.get("timestamp_us")) is not None:
+        details["time_us"] = time_us
     if (pose := record.get("sensor_to_world")) is not None:
-        details |= {"time_us": record["timestamp_us"], "pose": np.array(pose)}
+        details["pose"] = np.array(pose)
     if tracked:
         details["ids"] = np.array([box["track"] for box in record["boxes"]], np.int64)
     return details

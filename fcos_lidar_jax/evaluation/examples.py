@@ -32,6 +32,7 @@ def choose_examples(evaluation: Evaluation) -> Examples:
     order = np.argsort(-score, kind="stable")
     found = np.cumsum(hit[order])
     f1 = 2 * found / (np.arange(1, len(order) + 1) + truth.sum())
+    f1[:-1][np.diff(score[order]) == 0] = -1  # a threshold takes all equal scores
     min_score = float(score[order[np.argmax(f1)]]) if len(f1) else 0.0
     shown = score >= min_score
     hits = np.bincount(sample[shown & hit], minlength=num_samples)

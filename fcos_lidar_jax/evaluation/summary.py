@@ -80,10 +80,10 @@ def write_evaluation(
     :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`; ``report`` is called with the number of finished sets.
     For ``meta`` see :func:`full_summary`.
     """
+    (out / "bootstrap.json").unlink(missing_ok=True)  # it may be of other scores
     atomic_write(out / "metrics_summary.json", json.dumps(full_summary(evaluation, meta), indent=2))
     atomic_write(out / "curves.json", json.dumps(_curves(evaluation), indent=2))
     if not repeats:
-        (out / "bootstrap.json").unlink(missing_ok=True)
         return None
     intervals = bootstrap(evaluation, repeats=repeats, report=report)
     atomic_write(out / "bootstrap.json", json.dumps(intervals, indent=2))

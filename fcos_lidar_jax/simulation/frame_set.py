@@ -17,7 +17,7 @@ _OPTIONS = ("num_objects", "reach_m", "min_points", "reading", "fast_traffic", "
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedFrames(FrameSet):
-    """Frames of :func:`make_frame`, each of a different street, without points on the ego vehicle.
+    """Frames of :func:`make_frame`, each of a different street, without points near the sensor.
 
     By default objects are near, and only objects with enough points are annotated, so that a small detector can
     learn from them. Ten sweeps of fast traffic are a stress test for sweep fusion: the ego vehicle and the objects

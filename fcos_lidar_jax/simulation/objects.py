@@ -140,7 +140,8 @@ def vary_shape(rng: np.random.Generator, solids: np.ndarray, size_m: np.ndarray,
     """Vary the extents of an object's parts in place and independently, such that the box stays tight.
 
     Sides of parts at a side of the box do not move. Wheels and parts that extend beyond the box, such as the fence
-    on a barrier, keep their shapes.
+    on a barrier, keep their shapes. Only parts that are wider at the top, such as the body of a dump truck,
+    may then extend beyond it by decimetres.
 
     Args:
         solids: [s], in the frames of their boxes.

@@ -67,10 +67,11 @@ def sample_traffic(
     fast_traffic: bool,
     streets: Streets,
 ) -> Traffic:
-    """Sample objects that never touch each other, the ego vehicle or the scenery.
+    """Sample objects that do not touch each other, the ego vehicle or the scenery near the ground.
 
-    Each object is within ``reach_m`` of the ego vehicle at some time, at a distance distributed by
-    ``streets.spread``. For the other options see :func:`~.world.sample_world`.
+    In long worlds this holds every half second: fast objects may pass through others in between. Each object or
+    the row that it stands in begins beside a place of a street within ``reach_m`` of the ego vehicle at some time,
+    at a distance distributed by ``streets.spread``. For the other options see :func:`~.world.sample_world`.
 
     Args:
         ego: [1] of ``motion.MOTION``.

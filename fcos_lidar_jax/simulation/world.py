@@ -68,11 +68,11 @@ def sample_world(
     """Sample a world.
 
     Args:
-        reach_m: each object is within this distance of the ego vehicle at some time.
+        reach_m: each object or its row begins beside a place of a street within this distance of the ego vehicle.
         beyond_m: extent of the scenery around the path of the ego vehicle.
         labels: i32[m], classes of the objects; objects without room are omitted.
         level: ground without slopes.
-        fused: the world is scanned at its end only, as a few fused sweeps. Each object is within reach then.
+        fused: the world is scanned at its end only, as a few fused sweeps. Objects are within reach then.
         fast_traffic: the ego vehicle drives straight at 10 to 20 m/s, all lanes flow, and nearly all objects that
             can move do.
     """

@@ -113,11 +113,13 @@ def write_page(
     classes: Sequence[str],
     title: str,
     min_score: float = SHOWN_SCORE,
+    ego: bool = True,
 ) -> None:
     """Write the HTML page.
 
-    ``sensor`` gives the heading of the ego vehicle in frames without poses, by default along y; ``min_score`` is
-    the initial threshold of the visible boxes.
+    ``sensor`` gives the heading of the ego vehicle in frames without poses, by default along y; ``ego`` is False
+    for boxes in a global frame, where no heading is known. ``min_score`` is the initial threshold of the visible
+    boxes.
 
     >>> import tempfile
     >>> found = np.array([[0, 9, 0, 4, 2, 2, 0, 0, 0]]), np.array([0]), np.array([0.9])
@@ -129,6 +131,7 @@ def write_page(
     """
     content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}
     content |= {"colors": [*map(class_color, range(len(classes)))], "forward_rad": sensor and sensor.forward_rad}
+    content["ego"] = ego
     content |= {"frames": [dataclasses.asdict(frame) for frame in frames]}
     # Names may contain anything, even "</script>".
     text = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")

@@ -142,6 +142,8 @@ def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys
     assert {line["timestamp_us"] for line in lines} == {None}
     recorded = stream(home, tmp_path / "a.jsonl", home / "mcap")  # whose times are known
     assert [(line["timestamp_us"], line["sensor_to_world"]) for line in recorded] == [(t, None) for t in TIMES_US]
+    stream(home, tmp_path / "a.jsonl", home / "mcap", "--page", page := tmp_path / "page.html")
+    assert [frame["time_us"] for frame in page_content(page)["frames"]] == TIMES_US
     command("detect", home / "mcap", *where)
     assert json.loads((tmp_path / "b.json").read_text()) == {"files": recorded}
 

@@ -102,6 +102,18 @@ def test_truth_that_is_not_evaluated_is_reported():
         assert all(map(re.match, expected, lines))
 
 
+def test_the_threshold_of_examples_takes_all_equal_scores():
+    """One object is found with score 0.9, the other with 0.5, like eight boxes on nothing, and as the last of them."""
+    boxes = np.ones((10, 9), np.float32)
+    boxes[1:9, 0] = 20
+    boxes[9, 1] = 9
+    frame = Frame(np.zeros((0, 5), np.float32), boxes[[0, 9]], np.zeros(2, np.int32), np.ones(2, int))
+    scores = np.array([0.9] + 9 * [0.5], np.float32)
+    found = Detections(boxes, scores, np.zeros(10, np.int32), np.ones(10, bool), np.int32(0))
+    chosen = choose_examples(evaluate_frames([found], [frame], metric_of(["car"])))
+    assert chosen.min_score == np.float32(0.9)  # F1 is 2 / 3, and 4 / 12 of all
+
+
 def test_invalid_metrics_are_rejected():
     for classes, ranges, message in (
         ((), (), "ranges_m: got .*expected a positive length for each of at least one class"),
@@ -257,5 +269,10 @@ def test_files_and_report_of_own_classes(tmp_path):
     assert cells["mAP by centre distance, 95% interval"].count("0.") == 2
     lifts = int((evaluation.truth.label == OWN.index("fork$lift")).sum())
     assert cells["fork$lift"] == f"{lifts}" != "0"
-    write_evaluation(tmp_path, evaluation, {})
-    assert not (tmp_path / "bootstrap.json").exists()
+    with pytest.raises(KeyboardInterrupt):
+        write_evaluation(tmp_path, evaluation, {}, repeats=5, report=interrupt)
+    assert not (tmp_path / "bootstrap.json").exists(), "it would be of other scores"
+
+
+def interrupt(done):
+    raise KeyboardInterrupt

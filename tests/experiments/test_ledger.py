@@ -28,7 +28,7 @@ FOLDER = RESULTS / "tables/sector"
 def test_the_document_holds_the_ledger_of_the_files():
     text, ledger = README.read_text(), as_markdown()
     assert with_ledger(text, ledger) == text
-    with pytest.raises(ValueError, match="expected the lines .* around the ledger"):
+    with pytest.raises(ValueError, match=r"expected the lines .* around the ledger"):
         with_ledger(text.replace("<!-- end of", "<!-- the end of"), ledger)
     assert ledger.count("\n| priority | +") == 2
 
