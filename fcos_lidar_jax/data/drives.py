@@ -12,7 +12,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.data.sweeps import Sweep, check_gap, check_poses, read_entries
+from fcos_lidar_jax.data.sweeps import Sweep, check_poses, read_entries
 from fcos_lidar_jax.data.text_files import read_lines, read_number
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.progress import tell
@@ -158,7 +158,6 @@ def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list
     for place, file in clouds.items():
         if place not in entries:
             raise ValueError(f"{poses}: no pose of {file}, expected an entry for every cloud")
-    check_gap(poses, listed)
     ordered = [(clouds[place], entry) for place, entry in entries.items() if place in clouds]
     times = [entry.timestamp_us for _, entry in ordered]
     return [file for file, _ in ordered], times, [np.array(entry.sensor_to_world) for _, entry in ordered]

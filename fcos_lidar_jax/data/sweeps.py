@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -110,7 +110,6 @@ def read_list(path: Path) -> list[ListedSweep]:
         if sweep.timestamp_us >= newer.timestamp_us:
             expected = f"less than {newer.timestamp_us} of the entry before: the current sweep first, then by age"
             raise ValueError(f"{path}: $[{index}].timestamp_us: got {sweep.timestamp_us}, expected {expected}")
-    check_gap(path, sweeps)
     return sweeps
 
 
@@ -122,16 +121,12 @@ def read_entries(path: Path) -> list[ListedSweep]:
         if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6 or not is_rotation(pose[:3, :3]):
             expected = "a rotation in the upper left 3x3, and 0, 0, 0, 1 as the last row"
             raise ValueError(f"{where}.sensor_to_world: got {pose.tolist()}, expected {expected}")
-    return sweeps
-
-
-def check_gap(path: Path, sweeps: Sequence[ListedSweep]) -> None:
-    """Refuse a list whose times are not microseconds."""
     times = [sweep.timestamp_us for sweep in sweeps]
     gap_us = (max(times) - min(times)) / max(len(sweeps) - 1, 1)
     if len(sweeps) > 1 and not _GAP_US[0] <= gap_us <= _GAP_US[1]:
         expected = f"microseconds, {_GAP_US[0]} to {_GAP_US[1]} from sweep to sweep"
         raise ValueError(f"{path}: timestamp_us: got {gap_us:g} on average, expected {expected}")
+    return sweeps
 
 
 def is_rotation(matrix: np.ndarray) -> bool:

@@ -103,16 +103,16 @@ def test_names_that_are_not_sorted_by_their_numbers_are_refused(poses):
 
 
 @pytest.mark.parametrize(
-    ("names", "message"),
+    ("names", "gap_us", "message"),
     [
-        ("aa", "poses.json: got 2 entries for 1 clouds, expected each once"),
-        ("b", "poses.json: no pose of"),
-        ("ab", "poses.json: timestamp_us: got 50 on average, expected microseconds, 1000 to"),
+        ("aba", 50_000, "poses.json: got 3 entries for 2 clouds, expected each once"),
+        ("b", 50_000, "poses.json: no pose of"),
+        ("ab", 50, "poses.json: timestamp_us: got 50 on average, expected microseconds, 1000 to"),
     ],
 )
-def test_a_list_needs_every_cloud_once_and_microseconds(poses, names, message):
+def test_a_list_needs_every_cloud_once_and_microseconds(poses, names, gap_us, message):
     pose = {"sensor_to_world": np.eye(4).tolist()}
-    listed = [{"file": f"clouds/{n}.npy", "timestamp_us": 50 * i, **pose} for i, n in enumerate(names)]
+    listed = [{"file": f"clouds/{n}.npy", "timestamp_us": gap_us * i, **pose} for i, n in enumerate(names)]
     (poses / "poses.json").write_text(json.dumps(listed))
     with refused(message):
         drive_of(poses, "a", poses="poses.json")

@@ -109,8 +109,11 @@ BAD_SWEEPS = {
     "last row": ([entry(sensor_to_world=[*EYE[:3], [1, 1, 1, 1]])], "$[0].sensor_to_world: got [[1.0, 0.0, 0."),
     "mirrored": ([entry(sensor_to_world=np.diag([-1, 1, 1, 1.0]).tolist())], "expected a rotation in the upper"),
     "scaled": ([entry(sensor_to_world=np.diag([2, 2, 2, 1.0]).tolist())], "expected a rotation in the upper"),
-    "oldest first": ([entry(timestamp_us=t) for t in (9, 1, 8)], "$[2].timestamp_us: got 8, expected less than 1"),
-    "twice": ([entry(timestamp_us=9), *2 * [entry(timestamp_us=1)]], "$[2].timestamp_us: got 1, expected less"),
+    "oldest first": (
+        [entry(timestamp_us=1000 * t) for t in (9, 1, 8)],
+        "$[2].timestamp_us: got 8000, expected less",
+    ),
+    "twice": ([entry(timestamp_us=9000), *2 * [entry(timestamp_us=1)]], "$[2].timestamp_us: got 1, expected less"),
     "nanoseconds": ([entry(timestamp_us=50 * 10**6 + 1), entry()], "timestamp_us: got 5e+07 on average, exp"),
     "milliseconds": ([entry(timestamp_us=51), entry()], "timestamp_us: got 50 on average, exp"),
 }

@@ -103,7 +103,7 @@ def test_truth_that_is_not_evaluated_is_reported():
 
 
 def test_the_threshold_of_examples_takes_all_equal_scores():
-    """One object is found with score 0.9, the other with 0.5, like eight boxes on nothing, and as the last of them."""
+    """One object is found with score 0.9, the other with 0.5, like eight boxes on nothing before it."""
     boxes = np.ones((10, 9), np.float32)
     boxes[1:9, 0] = 20
     boxes[9, 1] = 9
