@@ -187,8 +187,8 @@ def rotated_iou_bev(
     """IoU in the ground plane, elementwise with broadcasting; differentiable in forward and reverse mode.
 
     Boxes are ``x, y, z, l, w, h, yaw, ...`` in metres and radians; sizes are not negative. Values lie in
-    [0, 1] and are 0 where both areas are zero. Gradients are finite for finite boxes. A NaN gives 0, and possibly
-    a NaN gradient; here, z and h do not matter.
+    [0, 1], up to rounding, and are 0 where both areas are zero. Gradients are finite for finite boxes. A NaN gives
+    0, and possibly a NaN gradient; here, z and h do not matter.
 
     Raises:
         ValueError: at trace time, if boxes have fewer than seven columns.

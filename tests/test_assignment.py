@@ -92,7 +92,7 @@ def test_a_diverged_prediction_ranks_last():
     assert targets.positive.tolist() == [False, False, True]
 
 
-def test_works_under_vmap_and_passes_no_gradient():
+def test_works_under_vmap():
     rng = np.random.default_rng(0)
     owner, cost, iou = i32(rng.integers(-1, 4, (3, 50))), f32(rng.random((3, 50))), f32(rng.random((3, 50)))
 
@@ -100,9 +100,3 @@ def test_works_under_vmap_and_passes_no_gradient():
     batched = jax.jit(jax.vmap(go))(owner, cost, iou)
     for b in range(3):
         np.testing.assert_array_equal(batched.positive[b], go(owner[b], cost[b], iou[b]).positive)
-
-    def value(c):
-        return jnp.where(go(owner[0], c, iou[0]).positive, c, 0.0).sum()
-
-    gradient = jax.jit(jax.grad(value))(cost[0])
-    np.testing.assert_array_equal(gradient, go(owner[0], cost[0], iou[0]).positive.astype(jnp.float32))

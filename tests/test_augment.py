@@ -55,15 +55,16 @@ def test_points_corners_headings_and_velocities_follow_one_matrix(name):
 
 
 def test_random_values_cover_their_ranges_and_the_sensor_stays_fixed():
-    origin = (1.43, 0.0, 2.184)
+    origin = (1.43, 0.5, 2.184)
     points, boxes = sample()
+    points[2:8, :3] = boxes[:, :3]
     points[0, :3] = origin
     points[1, :3] = (origin[0] + 10, origin[1], origin[2])
     go = jax.jit(
         jax.vmap(lambda k: augment(k, jnp.asarray(points), jnp.asarray(boxes), AugmentConfig(), origin_m=origin))
     )
-    moved, _ = go(jax.random.split(jax.random.key(0), 400))
-    moved = np.asarray(moved)
+    moved, moved_boxes = map(np.asarray, go(jax.random.split(jax.random.key(0), 400)))
+    np.testing.assert_allclose(moved_boxes[:, :, :3], moved[:, 2:8, :3], atol=3e-5)
     np.testing.assert_allclose(moved[:, 0, :3], np.tile(origin, (400, 1)), atol=1e-5)
     arm = moved[:, 1, :2] - moved[:, 0, :2]
     length, angle = np.linalg.norm(arm, axis=1) / 10, np.arctan2(arm[:, 1], arm[:, 0])
@@ -77,6 +78,15 @@ def test_random_values_cover_their_ranges_and_the_sensor_stays_fixed():
     reference = np.cross([10, 0, 0], [*(points[60, :2] - np.array(origin[:2])), 0])[2]
     hand = arm[:, 0] * third[:, 1] - arm[:, 1] * third[:, 0]
     assert 0.35 < np.mean(np.sign(hand) != np.sign(reference)) < 0.65
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_flip_mirrors_its_axis(axis):
+    points, boxes = sample()
+    config = AugmentConfig(1.0 - axis, float(axis), 0.0, (1.0, 1.0))
+    moved, _ = augment(jax.random.key(0), jnp.asarray(points), jnp.asarray(boxes), config)
+    expected = points * np.where(np.arange(5) == axis, -1, 1)
+    np.testing.assert_allclose(moved, expected, atol=1e-5)
 
 
 def test_augmentation_that_leaves_a_sensors_sector_is_rejected():

@@ -10,7 +10,8 @@ import pytest
 from jax import export
 
 from fcos_lidar_jax import nms
-from fcos_lidar_jax.nms import merge_boxes, rotated_nms
+from fcos_lidar_jax.config import InferenceConfig
+from fcos_lidar_jax.nms import merge_boxes, rotated_nms, suppress
 
 FORMS = pytest.mark.parametrize("form", ["rows", "matrix"])
 OPTIONS = {"iou_threshold": 0.2, "max_outputs": 100}
@@ -155,14 +156,34 @@ def test_merged_boxes_are_weighted_means_of_overlapping_boxes(form, overlap):
         boxes = np.concatenate([boxes, rng.normal(0, 5, (len(boxes), 2)).astype(np.float32)], axis=1)
         scores = np.maximum(scores, np.float32(0.01))
         kept, used = compute(boxes[:, :7], scores, valid, labels=labels, **OPTIONS, overlap="bev", form="rows")
+        boxes[~valid] = np.nan
         actual = np.asarray(merge(boxes, scores, valid, kept, used, labels=labels, **options))
         assert not actual[~np.asarray(used)].any()
         best = indices(kept, used)
         expected = merged_by_loops(boxes, scores, valid, labels, best, 0.3, vertical=overlap == "3d")
         difference = actual[np.asarray(used)] - expected
         difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
-        np.testing.assert_allclose(difference, 0, atol=2e-4)
+        np.testing.assert_allclose(difference, 0, atol=5e-6)
         assert np.abs(expected - boxes[best]).max() > 0.05
+
+
+@pytest.mark.parametrize("overlap", ["bev", "3d"])
+@pytest.mark.parametrize("merge_iou", [None, 0.3])
+def test_suppression_follows_the_configuration(overlap, merge_iou):
+    boxes, scores, valid, labels = clusters(0, 100)
+    boxes = np.concatenate([boxes, np.ones((100, 2), np.float32)], axis=1)
+    scores = np.maximum(scores, np.float32(0.01))
+    config = InferenceConfig(iou_threshold=0.2, nms_overlap=overlap, merge_iou=merge_iou, max_detections=40)
+    results = jax.jit(suppress, static_argnums=4)(boxes, scores, labels, valid, config)
+    found, _, found_labels, used = map(np.asarray, results)
+    kept = oracles.nms(boxes[:, :7], scores, valid, labels, 0.2, 40, vertical=overlap == "3d")
+    assert found_labels[used].tolist() == labels[kept].tolist()
+    expected = boxes[kept]
+    if merge_iou is not None:
+        expected = merged_by_loops(boxes, scores, valid, labels, kept, merge_iou, vertical=overlap == "3d")
+    difference = found[used] - expected
+    difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(difference, 0, atol=5e-6)
 
 
 @pytest.mark.parametrize("slots", [10, 40])

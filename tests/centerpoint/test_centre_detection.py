@@ -50,7 +50,7 @@ def test_candidates_are_the_best_pairs_of_cell_and_class_also_under_vmap(outputs
         near = (np.abs(expected[:2]) <= 16).all() and abs(expected[2]) <= 10
         assert valid[slot] == near
         assert (labels[slot], scores[slot]) == (label, pytest.approx(-score if near else 0, abs=1e-6))
-        np.testing.assert_allclose(boxes[slot], expected, atol=1e-4)
+        np.testing.assert_allclose(boxes[slot], expected, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def test_matching_excludes_the_limit_and_respects_classes_and_headings():
         assert len(match_frame(np.array([box(0, 0, yaw)]), labels, *args, **limits).truth) == hits
 
 
-def test_heading_error():
+def test_the_heading_error_is_taken_modulo_the_period_of_the_class():
     labels = [CAR, BARRIER, BARRIER, CONE, CAR]
     differences = np.array([np.pi, np.pi, 2.0, 1.0, 2 * np.pi + 0.1])
     error = heading_error(differences, np.zeros(5), NUSCENES_METRIC.heading_period_rad[labels])

@@ -171,7 +171,8 @@ def test_weights_are_transferred_once(detector, monkeypatch):
     assert arrays(first) == arrays(second)
 
 
-def test_detections_with_flips_are_equivariant_to_mirrored_clouds(detector):
+@pytest.mark.parametrize("axis", [0, 1])
+def test_detections_with_flips_are_equivariant_to_mirrored_clouds(detector, axis):
     sensor = dataclasses.replace(SENSOR, origin_m=(0.5, -0.25, 0.0))
     inference = dataclasses.replace(CONFIG.inference, flips="xy", merge_iou=0.3)
     config, variables = (
@@ -180,14 +181,16 @@ def test_detections_with_flips_are_equivariant_to_mirrored_clouds(detector):
     )
     detect = jax.jit(make_detect(build_detector(config, sensor)))
     points = make_frame(0, SENSOR).points
-    mirrored = points * np.array([-1, 1, 1, 1, 1], np.float32) + np.array([1, 0, 0, 0, 0], np.float32)
+    mirrored, middle = points.copy(), sensor.origin_m[axis]
+    mirrored[:, axis] = 2 * middle - points[:, axis]
     valid = np.ones(len(points), bool)
     found, back = detect(variables, points, valid), detect(variables, mirrored, valid)
     assert found.valid.sum() > 10
     np.testing.assert_allclose(back.scores, found.scores, atol=1e-5)
     expected = np.asarray(found.boxes)[np.asarray(found.valid)]
-    expected[:, 0] = 1 - expected[:, 0]
-    expected[:, 6], expected[:, 7] = np.pi - expected[:, 6], -expected[:, 7]
+    expected[:, axis] = 2 * middle - expected[:, axis]
+    expected[:, 6] = (np.pi if axis == 0 else 0) - expected[:, 6]
+    expected[:, 7 + axis] *= -1
     difference = np.asarray(back.boxes)[np.asarray(found.valid)] - expected
     difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
     # Boxes with nearly equal scores may change places.

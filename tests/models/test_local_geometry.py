@@ -73,8 +73,8 @@ def test_offsets_are_their_definition_in_loops_also_under_jit_and_vmap(circular,
     def compute(image):
         return local_offsets(image, mean=MEAN, scale=SCALE, circular=circular)
 
-    np.testing.assert_allclose(jax.jit(compute)(image), expected, atol=1e-3)
-    np.testing.assert_allclose(jax.jit(jax.vmap(compute))(image[:, None])[:, 0], expected, atol=1e-3)
+    np.testing.assert_allclose(jax.jit(compute)(image), expected, atol=1e-4)
+    np.testing.assert_allclose(jax.jit(jax.vmap(compute))(image[:, None])[:, 0], expected, atol=1e-4)
     assert 0.2 < (expected[..., 3::4] == 1).mean() < 0.8
     assert len(window()) == 20
 
@@ -105,8 +105,8 @@ def test_offsets_between_rounds_are_their_definition_in_loops(rounds):
 
     expected = later_by_loops(image, rounds)
     assert expected.shape[-1] == 5 * (rounds - 1)
-    np.testing.assert_allclose(jax.jit(compute)(image), expected, atol=1e-3)
-    np.testing.assert_allclose(jax.jit(jax.vmap(compute))(image[:, None])[:, 0], expected, atol=1e-3)
+    np.testing.assert_allclose(jax.jit(compute)(image), expected, atol=1e-4)
+    np.testing.assert_allclose(jax.jit(jax.vmap(compute))(image[:, None])[:, 0], expected, atol=1e-4)
     if rounds > 1:
         assert 0.2 < (expected[..., 4::5] == 1).mean() < 0.8
         assert len(np.unique(expected[..., 3::5])) > 9
@@ -128,7 +128,7 @@ def test_features_are_two_layers_of_the_offsets_and_of_the_points_own_numbers():
         norm = p[f"norm{layer}"]
         x = np.maximum((y - s["mean"]) / np.sqrt(s["var"] + EPSILON) * norm["scale"] + norm["bias"], 0)
     found = module.apply(variables, image, train=False)
-    np.testing.assert_allclose(found, x, rtol=1e-3, atol=1e-2)
+    np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-4)
     assert variables["params"]["linear0"].shape == (85, HIDDEN)
     assert (x > 0).any()
 

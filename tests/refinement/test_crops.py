@@ -96,7 +96,7 @@ def test_both_sorts_give_the_same_order():
 
 
 @pytest.mark.parametrize("number", [0, 1, 31, 33])
-def test_few_points(number):
+def test_all_points_are_found_if_they_do_not_fill_a_word(number):
     points = np.tile(np.float32([1, 2, 3, 4, 5]), (number, 1))
     box = np.array([[1, 2, 3, 1, 1, 1, 0.0]])
     found = crop(points, np.ones(number, bool), box, **OPTIONS)

@@ -57,7 +57,7 @@ def found(refinement: RefinementConfig | None, variables=None):
     return jax.device_get(detect(refinement)(variables, batch.points[0], batch.valid[0]))
 
 
-def test_boxes_are_the_detectors_best_with_the_mean_of_both_scores():
+def test_boxes_are_the_detectors_best_with_the_weighted_geometric_mean_of_both_scores():
     """With zero weights all classes are equally probable and no box moves."""
     _, variables = detector(SMALL)
     zero = jax.tree.map(jnp.zeros_like, variables["params"]["refinement"])

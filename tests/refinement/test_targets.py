@@ -1,5 +1,6 @@
 """Targets of the second look against a loop over boxes and objects."""
 
+import dataclasses
 import functools
 
 import jax
@@ -7,8 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+import tiny_run
 
+from fcos_lidar_jax.refinement import stage
 from fcos_lidar_jax.refinement.targets import encode_residual, match_boxes, move_boxes
+from fcos_lidar_jax.refinement.types import LookInputs, RefinementTargets
 
 OPTIONS = {"num_classes": 3, "radius_range_m": (1.0, 2.0), "between_weight": 0.25}
 match = jax.jit(match_boxes, static_argnames=(*OPTIONS, "with_velocity"))
@@ -58,7 +62,7 @@ def test_targets_equal_a_loop(seed, with_velocity):
     boxes, truth = arrays[0], arrays[3]
     moved = np.asarray(move_boxes(jnp.asarray(boxes), jnp.asarray(targets.residual)))[owner >= 0]
     own = truth[owner[owner >= 0]]
-    np.testing.assert_allclose(moved[:, :3], own[:, :3], atol=1e-4)
+    np.testing.assert_allclose(moved[:, :3], own[:, :3], atol=2e-6)
     np.testing.assert_allclose(np.cos(moved[:, 6] - own[:, 6]), 1, atol=1e-5)
     np.testing.assert_allclose(moved[:, 7:], own[:, 7:], atol=1e-4)
     assert np.isnan(targets.residual).any() == with_velocity
@@ -108,3 +112,50 @@ def test_gradients_are_finite_for_degenerate_boxes():
     boxes, gradient = jnp.zeros((3, 9)), jax.jit(jax.grad(total, argnums=(0, 1, 2)))
     for size in (8, 10):
         assert all(np.isfinite(g).all() for g in gradient(boxes, boxes, jnp.zeros((3, size))))
+
+
+def test_losses_are_weighted_sums_over_boxes(monkeypatch):
+    rng, config = np.random.default_rng(0), dataclasses.replace(tiny_run.REFINED, num_sweeps=2)
+    kinds = len(config.classes)
+    logits, residual, wanted = (rng.normal(0, 2, (2, 6, n)).astype(np.float32) for n in (kinds + 1, 10, 10))
+    wanted[0, :3, 6:8] = np.nan  # unknown velocities
+    label, near = rng.integers(0, kinds + 1, (2, 6)), rng.random((2, 6)) < 0.6
+    label[0, :2] = logits[0, :2].argmax(axis=-1)
+    weight = rng.choice(np.float32([0, 0.3, 1]), (2, 6))
+    weight[0, 0] = 1
+    monkeypatch.setattr(stage, "look", lambda *_: (jnp.asarray(logits), jnp.asarray(residual)))
+    targets = RefinementTargets(*map(jnp.asarray, (label.astype(np.int32), wanted, near, weight)))
+    unused = LookInputs(jnp.zeros((2, 6, 1, 14)), jnp.zeros((2, 6, 1), bool), jnp.zeros((2, 6, 1)), None)
+    sums = stage.look_sums(config, {}, unused, targets)
+    entropy = distance = right = 0.0
+    for place in np.ndindex(2, 6):
+        odds = np.exp(logits[place].astype(np.float64))
+        entropy -= weight[place] * np.log(odds[label[place]] / odds.sum())
+        off = np.abs(residual[place].astype(np.float64) - wanted[place])
+        off[6:8] *= config.loss.velocity_weight
+        distance += near[place] * np.nansum(off)
+        right += (weight[place] > 0) * (odds.argmax() == label[place])
+    np.testing.assert_allclose(sums.losses["refined_boxes"]["refined_class"], entropy, rtol=1e-5)
+    np.testing.assert_allclose(sums.losses["refined_near"]["refined_box"], distance, rtol=1e-5)
+    counts = (weight > 0).sum(), near.sum(), (label < kinds).sum()
+    assert tuple(map(int, sums.counts.values())) == counts
+    assert float(sums.means["refined_boxes"]["refined_accuracy"]) == right > 0
+
+
+def test_scores_are_of_the_class_of_each_box(monkeypatch):
+    config = dataclasses.replace(tiny_run.REFINED, refinement=dataclasses.replace(tiny_run.LOOK, move_boxes=False))
+    logits = np.random.default_rng(0).normal(0, 2, (8, len(config.classes) + 1)).astype(np.float32)
+    monkeypatch.setattr(stage, "look", lambda *_: (jnp.asarray(logits), jnp.zeros((8, 8))))
+    place = np.zeros((3, 9), np.float32)
+    place[:, 0], place[:, 3:6], labels = [5, 10, 15], 1, np.array([3, 0, 7], np.int32)
+    cloud, boxes = (np.zeros((4, 5), np.float32), np.zeros(4, bool)), (place, np.float32([0.9, 0.8, 0.7]), labels)
+    given = map(jnp.asarray, (*cloud, *boxes, np.ones(3, bool)))
+    found, scores, found_labels, _ = stage.refine_boxes(
+        stage.make_network(config), config, tiny_run.SENSOR, {}, *given
+    )
+    odds = np.exp(logits[:3].astype(np.float64))
+    expected = odds[range(3), labels] / odds.sum(axis=1)
+    order = np.argsort(-expected)
+    np.testing.assert_allclose(scores[:3], expected[order], rtol=1e-5)
+    assert found_labels[:3].tolist() == labels[order].tolist()
+    np.testing.assert_array_equal(found[:3], place[order])

@@ -28,6 +28,7 @@ from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import NonFiniteLossError, fit, make_optimizer, make_state, make_train_step, plan
+from fcos_lidar_jax.training.optimizer import learning_rate_schedule, momentum_schedule
 from fcos_lidar_jax.training.step import detection_variables, make_gradient
 from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums, TrainState
 
@@ -159,19 +160,46 @@ def test_the_owner_of_a_location_is_the_owner_of_its_first_round_point():
     assert sum(box >= 0 for box in expected) > 10
 
 
-def test_the_optimizer_clips_decays_and_reports():
-    """By hand: the first step of AdamW is the sign of the clipped gradient, plus decay."""
-    config = OptimizerConfig()
+def test_the_optimizer_is_adamw_of_clipped_gradients():
+    """A large and a small gradient: AdamW's first step does not depend on the length of the gradient."""
+    config, params = OptimizerConfig(), np.array([2.0, -1.0])
     optimizer = make_optimizer(config, 10)
-    params = {"w": jnp.array([2.0, -1.0])}
-    state = optimizer.init(params)
-    grads = {"w": jnp.array([300.0, -400.0])}
-    updates, state = optimizer.update(grads, state, params)
-    clipped = np.array([300.0, -400.0]) * 35 / 500
-    expected = -1e-3 * (clipped / (np.abs(clipped) + 1e-8) + 0.01 * np.array([2.0, -1.0]))
-    np.testing.assert_allclose(updates["w"], expected, rtol=1e-5)
-    np.testing.assert_allclose(state[1].hyperparams["learning_rate"], 1e-3, rtol=1e-6)
-    np.testing.assert_allclose(state[1].hyperparams["b1"], 0.95, rtol=1e-6)
+    state, mean, square = optimizer.init({"w": jnp.asarray(params)}), np.zeros(2), np.zeros(2)
+    for step, gradient in enumerate(np.array([[300.0, -400.0], [3.0, 4.0]])):
+        updates, state = optimizer.update({"w": jnp.asarray(gradient)}, state, {"w": jnp.asarray(params)})
+        b1, rate = (float(of(config, 10)(step)) for of in (momentum_schedule, learning_rate_schedule))
+        clipped = gradient * min(1.0, 35 / np.linalg.norm(gradient))
+        mean, square = b1 * mean + (1 - b1) * clipped, 0.99 * square + 0.01 * clipped**2
+        scaled = mean / (1 - b1 ** (step + 1)), square / (1 - 0.99 ** (step + 1))
+        expected = -rate * (scaled[0] / (np.sqrt(scaled[1]) + 1e-8) + 0.01 * params)
+        np.testing.assert_allclose(updates["w"], expected, rtol=1e-4)
+        params = params + expected
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        OptimizerConfig(),
+        OptimizerConfig(
+            peak_learning_rate=0.003,
+            initial_divisor=4,
+            final_divisor=100,
+            warmup_fraction=0.3,
+            b1_range=(0.8, 0.9),
+        ),
+    ],
+)
+def test_schedules_are_cosines_between_the_values_of_the_configuration(config):
+    peak, (low, high), turn = config.peak_learning_rate, config.b1_range, 1000 * config.warmup_fraction
+    rates = peak / config.initial_divisor, peak, peak / config.initial_divisor / config.final_divisor
+    for make, values in ((learning_rate_schedule, rates), (momentum_schedule, (high, low, high))):
+        schedule = make(config, 1000)
+        for step in (*range(0, 1000, 37), 1000):
+            risen = step < turn
+            begin, end = values[:2] if risen else values[1:]
+            share = step / turn if risen else (step - turn) / (1000 - turn)
+            expected = end + (begin - end) * (1 + np.cos(np.pi * share)) / 2
+            assert float(schedule(step)) == pytest.approx(expected, rel=1e-3)
 
 
 def test_the_loop_reads_all_metrics_before_a_pause_and_stops_when_asked(trainer):
@@ -309,7 +337,7 @@ def test_a_new_loss_is_divided_by_the_locations_of_the_regression(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_target_of_the_score_factor_is_the_iou_or_the_centreness():
+def test_assignment_and_losses_of_a_sample_equal_numpy():
     """Predictions are half a metre above the truth: centreness is constant, and IoU depends on the height."""
     detector, batch = toy_detector(), jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], four_frames())
     params, layout = detector.init(jax.random.key(0))["params"], image_layout(SENSOR, CONFIG.model)
@@ -334,6 +362,19 @@ def test_the_target_of_the_score_factor_is_the_iou_or_the_centreness():
         expected = (np.log1p(np.exp(logits)) - target * logits)[inside].sum()
         np.testing.assert_allclose(total, expected, rtol=1e-3)
         assert int(count) == inside.sum() > 10
+    odds, rows = np.exp(np.asarray(outputs.logits, np.float64)), np.arange(len(label))
+    cost = -np.log(odds[rows, label] / odds.sum(1))
+    positive, _ = oracles.assign(np.asarray(owner), cost, overlap, len(batch.boxes), 5)
+    for regress_on, mask in (("positives", positive), ("candidates", inside)):
+        choices = dataclasses.replace(CONFIG.loss, regress_on=regress_on, iou_loss="log_iou", top_q=5)
+        parts, targets, counts = sample_losses(*sample, config=choices, layout=layout, axes="lidar")
+        np.testing.assert_array_equal(targets.positive, positive)
+        np.testing.assert_allclose(parts["l1"][0], 0.5 * mask.sum(), rtol=1e-4)
+        np.testing.assert_allclose(parts["iou"][0], -np.log(np.maximum(overlap, 1e-6))[mask].sum(), rtol=1e-3)
+        assert int(parts["l1"][1]) == mask.sum()
+        assert int(counts["unique_positives"]) == len(np.unique(location_cells(layout)[positive])) < positive.sum()
+        levels = np.split(positive, np.cumsum(layout.level_sizes)[:-1])
+        assert counts["positives_per_level"].tolist() == [level.sum() for level in levels]
 
 
 ZERO = {"params": {"w": jnp.float32(0)}, "batch_stats": {}}
@@ -363,9 +404,10 @@ def squares():
     return detector, batch, row_lists
 
 
-def test_augmentation_depends_only_on_seed_and_step(squares):
+def test_augmentation_depends_only_on_seed_step_and_place_in_the_batch(squares):
     config = dataclasses.replace(with_optimizer(ema_decay=0.0, batch_size=8), augment=QUICKSTART.augment)
     detector, optimizer, batch = squares[0](config), optax.sgd(0.0), squares[1]
+    batch.boxes[:, :, 0] = 8  # eight equal samples
     state = make_state(detector, optimizer, jax.random.key(0), variables=ZERO)
     later = dataclasses.replace(state, step=state.step + 1)
     other = dataclasses.replace(state, key=jax.random.key(1))
@@ -373,6 +415,8 @@ def test_augmentation_depends_only_on_seed_and_step(squares):
     first, again, later, other = (float(step(each, batch)[1]["loss/total"]) for each in states)
     assert first == again
     assert len({first, later, other}) == 3
+    jax.effects_barrier()
+    assert len({*next(filter(None, squares[2]))}) == 8
 
 
 RATE = optax.inject_hyperparams(optax.sgd)(learning_rate=0.125)
@@ -403,6 +447,9 @@ def test_a_step_works_with_any_optimizer_and_reports_its_hyperparameters(squares
     }
     for key, value in expected.items():
         assert float(metrics[key]) == pytest.approx(value)
+    if until == 1:  # the weight was zero
+        gradient = np.mean(2 * batch.boxes[..., 0][batch.box_valid])
+        assert float(metrics["gradient_norm"]) == pytest.approx(gradient)
 
 
 @pytest.mark.parametrize("num_micro", [1, 2])
