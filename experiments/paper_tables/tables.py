@@ -196,7 +196,7 @@ def _row_record(table: Table, row: Row, cells: dict[str, list[Cell]]) -> dict[st
         record["diverged"] = [f"seed {cell['seed']}: {cell['diverged']}" for cell in own if "diverged" in cell]
         for s in SCORES:
             record[s] = _summary([100 * cell[s] for cell in scores if cell])
-            arms = [[100 * cell[s] for cell in row if cell] for row in (scores, base)]
+            arms = [[100 * cell[s] for cell in arm if cell] for arm in (scores, base)]
             record[f"{s}_difference"] = _difference(*arms) if all(arms) and row is not reference else None
     return record
 
@@ -229,8 +229,8 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
             if trained:
                 cells += [_text(row.get(s)), "-" if itself else _text(row.get(f"{s}_difference"), sign=True)]
             if of_paper:
-                gain = row["paper_difference"].get(s)
-                cells += [_number(row["paper"].get(s)), "-" if itself else _number(gain, sign=True)]
+                difference = row["paper_difference"].get(s)
+                cells += [_number(row["paper"].get(s)), "-" if itself else _number(difference, sign=True)]
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         rows.append(cells)
     lines += markdown_table([*header, *extra], rows)

@@ -115,9 +115,10 @@ def _has(option: _Option, value: str) -> bool:
     return option.value == value if value else option.is_given
 
 
-def exit_without(option: str, other: str) -> NoReturn:
-    """Exit like for a missing option that is always required."""
-    print(f"fcos-lidar: error: {option}: got none, expected one, or {other}", file=sys.stderr)
+def exit_without(option: str, other: str | None = None) -> NoReturn:
+    """Exit with 2, like tyro without a required option."""
+    more = f", or {other}" if other else ""
+    print(f"fcos-lidar: error: {option}: got none, expected one{more}", file=sys.stderr)
     sys.exit(2)
 
 

@@ -54,7 +54,7 @@ class DataOptions:
 
     @functools.cached_property
     def data_set(self) -> DataSet:
-        if self.data_root is None and self.format is None:
+        if self.data_root is None and self.format != "simulated":
             exit_without("--data-root", "--format simulated")
         return find_data_set(self.data_root, self.format, self.version)
 

@@ -32,7 +32,8 @@ from fcos_lidar_jax.sensors import KITTI_HDL64E
 _LISTED = Excludes(("files", "full_turn"), "the list names the files, which keep all points")
 _INPUT = (
     f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them; or one recording that "
-    "`fcos-lidar stream` reads, whose sweeps are fused if it has poses."
+    "`fcos-lidar stream` reads. Sweeps of KITTI raw and Argoverse 2 are fused; for poses or a topic of a ROS "
+    "recording, use `stream`."
 )
 
 

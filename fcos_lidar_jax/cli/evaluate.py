@@ -13,7 +13,7 @@ import tyro
 from fcos_lidar_jax.checkpoints.preemption import take_sigterm_back
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import Excludes, Or, Output, check_out_file, option_name
+from fcos_lidar_jax.cli.checks import Excludes, Or, Output, check_out_file, exit_without, option_name
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
 from fcos_lidar_jax.cli.processes import ProcessOptions, join_processes
@@ -61,8 +61,8 @@ class Evaluate:
     The command writes metrics_summary.json, curves.json, report.html, frames.html (the worst and the best frames),
     and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI, it also writes
     metrics_kitti.json and result files in results_kitti. After Ctrl-C or a kill, the same command resumes
-    the detection and repeats at most one batch, and clouds without usable points. Once they are written, --results
-    evaluates the detections again.
+    the detection and repeats at most one batch, and clouds without usable points. To evaluate finished
+    detections again, use --results.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
@@ -94,6 +94,8 @@ class Evaluate:
 
 def run(args: Evaluate) -> None:
     """Detect if a detector is given, evaluate, write, and print the scores."""
+    if args.results and not (args.ground_truth or args.data.data_root or args.data.format):
+        exit_without("--data-root", "--ground-truth")
     _check_written(args)
     is_folder = args.results is not None and args.results.is_dir() and args.ground_truth is None
     if is_folder and args.data.data_set.reader.result_folders:

@@ -25,7 +25,7 @@ def option(
     """Describe an option in the help: the placeholder of its value, and the text shown for a default of None.
 
     Without ``default``, the help calls an option optional if its default is None. By default, the text is the
-    comment or docstring of the field.
+    comment or docstring of the field. ``aliases`` are further names.
     """
 
     def hint(label: str) -> str:
@@ -77,7 +77,7 @@ MinScore = Annotated[
     Score,
     option(
         "SCORE",
-        default="0 in files; pictures, pages and recordings show boxes from 0.3",
+        default="0 in files; pictures, pages and Rerun files show boxes from 0.3",
         text="Leave out boxes with a lower score.",
     ),
 ]

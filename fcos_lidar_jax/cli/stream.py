@@ -93,7 +93,7 @@ class Stream:
     min_score: Annotated[
         options.Score,
         option(
-            "SCORE", default=f"{_TRACKED_SCORE} with --track, else 0; pages and recordings show boxes from 0.3"
+            "SCORE", default=f"{_TRACKED_SCORE} with --track, else 0; pages and Rerun files show boxes from 0.3"
         ),
     ] = None
     """Leave out boxes with a lower score, before tracking."""

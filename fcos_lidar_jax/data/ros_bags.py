@@ -44,10 +44,11 @@ def is_ros_bag(path: Path) -> bool:
     """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder of them or with their metadata."""
     if path.suffix in BAG_ENDINGS or not path.is_dir():
         return path.suffix in BAG_ENDINGS
-    names, text = [file.name.lower() for file in path.iterdir()], _metadata(path)
-    if any(name.endswith(ENDINGS) for name in names):
-        return _LISTS in (text or "")
-    return text is not None or any(name.endswith(BAG_ENDINGS) for name in names)
+    if _LISTS in (_metadata(path) or ""):
+        return True
+    files = [*path.iterdir()]
+    points = any(file.name.lower().endswith(ENDINGS) for file in files)
+    return not points and any(file.suffix in BAG_ENDINGS for file in files)
 
 
 def _files(path: Path) -> list[Path]:

@@ -34,8 +34,8 @@ def make_frame(
     Args:
         seed: any non-negative integer.
         num_objects: number of objects, or their mean with ``streets.setting``; objects without room are omitted.
-        reach_m: maximum distance of the objects along the street, in rows of their first object; by default 80 %
-            of the sensor's range limit.
+        reach_m: maximum distance along the street of each object, or of the first object of its row; by default
+            80 % of the sensor's range limit.
         min_points: objects with fewer points in the current sweep are not annotated.
         reading: the sweeps to fuse, see :func:`scan_sweeps`; the world moves between sweeps.
     """
@@ -70,8 +70,8 @@ def scan_sweeps(
 ) -> tuple[np.ndarray, int]:
     """Fuse the sweeps up to a moment in the sensor's frame at that moment, current sweep first, then by age.
 
-    Sweeps are ``SWEEP_S`` apart. Close points, in plain streets on the roof of the ego vehicle, are removed from
-    all sweeps or from no sweep.
+    Sweeps are ``SWEEP_S`` apart. Close points are removed from all sweeps or from no sweep. In plain streets
+    they lie on the roof of the ego vehicle.
 
     Returns points f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, with lag exactly 0 for the current
     sweep, and the number of removed points.

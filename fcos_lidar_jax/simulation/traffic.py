@@ -69,8 +69,8 @@ def sample_traffic(
 ) -> Traffic:
     """Sample objects that do not touch each other, the ego vehicle or the scenery near the ground.
 
-    In long worlds this holds every half second: fast objects may pass through others in between. Each object or
-    the row that it stands in begins beside a place of a street within ``reach_m`` of the ego vehicle at some time,
+    In long worlds this holds every half second: fast objects may pass through others in between. Each object, or
+    the row it stands in, begins beside a place of a street within ``reach_m`` of the ego vehicle at some time,
     at a distance distributed by ``streets.spread``. For the other options see :func:`~.world.sample_world`.
 
     Args:

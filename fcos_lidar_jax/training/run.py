@@ -77,7 +77,7 @@ def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> 
         if first == spec.steps and not pending:
             tell(f"{spec.out}: the run is complete, with {first} steps")
             if is_main_process:
-                draw_metrics(spec.out)  # unless the run was ended before
+                draw_metrics(spec.out)  # a run that was ended while it drew may lack them
             return start
         log = MetricsLog(spec.out, first_step=first) if is_main_process else None
         if log is not None:

@@ -72,16 +72,17 @@ def test_rows_beyond_physical_limits_are_marked_invalid(column, absurd, fine):
     assert (cloud.num_invalid, cloud.num_close, cloud.num_truncated) == (2, 0, 0)
 
 
-def test_close_points_are_removed_and_counted_once():
+@pytest.mark.parametrize(("mode", "removed"), [("all", [0, 1, 2]), ("sweeps", [2])])
+def test_close_points_are_removed_as_configured_and_counted_once(mode, removed):
     points = numbered()
     points[:4, :2] = [[0.5, -0.5], [1.0, 0], [-0.99, 0.99], [0, 0]]
     points[:4, 4] = [0, 0, 0.05, 0.05]
     points[3, 3] = np.nan  # close and not finite: counted as not finite
-    cloud = cloud_of(points, remove="all", close_m=1.01)
-    assert np.flatnonzero(~cloud.valid[:150]).tolist() == [0, 1, 2, 3]
-    assert (cloud.num_close, cloud.num_invalid) == (3, 1)
-    assert (cloud.num_points, cloud.num_removed) == (150, 4)
-    read = cloud_of(points, remove="all", close_m=1.01, num_close=11)  # the reader has removed close points
+    cloud = cloud_of(points, remove=mode, close_m=1.01)
+    assert np.flatnonzero(~cloud.valid[:150]).tolist() == [*removed, 3]
+    assert (cloud.num_close, cloud.num_invalid) == (len(removed), 1)
+    assert (cloud.num_points, cloud.num_removed) == (150, len(removed) + 1)
+    read = cloud_of(points, remove=mode, close_m=1.01, num_close=11)  # the reader has removed close points
     assert np.flatnonzero(~read.valid[:150]).tolist() == [3]
     assert (read.num_points, read.num_close, read.num_removed) == (161, 11, 12)
 
