@@ -1,6 +1,7 @@
 """All commands with their options."""
 
 import contextlib
+import dataclasses
 import io
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -21,7 +22,29 @@ from fcos_lidar_jax.cli import (
     synthesize,
     train,
 )
-from fcos_lidar_jax.cli.checks import check_options
+from fcos_lidar_jax.cli.checks import check_options, option_name
+from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, find_recording
+
+
+def _detect(args: detect.Detect) -> None:
+    """Detect in point files, or like ``stream`` in one recording."""
+    if drives := [path for path in args.files if path.exists() and find_recording(path) is not FOLDER]:
+        if len(args.files) > 1:
+            raise ValueError(f"{drives[0]}: got a recording beside other inputs, expected only the recording")
+        stream.run(_as_stream(args), in_lines=False)
+    else:
+        detect.run(args)
+
+
+def _as_stream(args: detect.Detect) -> stream.Stream:
+    """The options for a recording; rejects options that only point files have."""
+    shared = {field.name for field in dataclasses.fields(stream.Stream)}
+    for field in dataclasses.fields(detect.Detect):
+        if field.name not in {*shared, "files"} and getattr(args, field.name) != field.default:
+            raise ValueError(f"{option_name(field.name)}: {args.files[0]}: got a recording, expected point files")
+    given = {name: value for name, value in vars(args).items() if name in shared}
+    return stream.Stream(source=args.files[0], **given)
+
 
 _COMMANDS = {
     "demo": (demo.Demo, demo.run, "detect objects in a simulated drive; needs no data"),
@@ -29,7 +52,7 @@ _COMMANDS = {
     "prepare": (prepare.Prepare, prepare.run, "extract objects for copy-paste; index nuScenes"),
     "train": (train.Train, train.run, "train a detector, or resume a run"),
     "evaluate": (evaluate.Evaluate, evaluate.run, "write metrics, a report and a page of frames"),
-    "detect": (detect.Detect, detect.run, "write the boxes of point files, or of a recording"),
+    "detect": (detect.Detect, _detect, "write the boxes of point files, or of a recording"),
     "stream": (stream.Stream, stream.run, "write the boxes of a drive, sweep by sweep"),
     "project": (project.Project, project.run, "write the range image of a point file"),
     "export": (export.Export, export.run, "export a detector to a single file, or to ONNX"),

@@ -19,6 +19,7 @@ from fcos_lidar_jax.input_pipeline.open import (
     CLASS_MAPS,
     DataSet,
     Format,
+    MissingRootError,
     Reader,
     default_split,
     find_data_set,
@@ -54,9 +55,10 @@ class DataOptions:
 
     @functools.cached_property
     def data_set(self) -> DataSet:
-        if self.data_root is None and self.format != "simulated":
-            exit_without("--data-root", "--format simulated")
-        return find_data_set(self.data_root, self.format, self.version)
+        try:
+            return find_data_set(self.data_root, self.format, self.version)
+        except MissingRootError:
+            exit_without("--data-root")
 
     def split(self, purpose: Literal["train", "val"], given: str | None, *, required: bool = True) -> str | None:
         """The given split, or the default for a purpose."""

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 
-from fcos_lidar_jax.cli import options, stream
-from fcos_lidar_jax.cli.checks import Excludes, Or, Output, option_name
+from fcos_lidar_jax.cli import options
+from fcos_lidar_jax.cli.checks import Excludes, Or, Output
 from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.sinks import check_results, open_sinks
 from fcos_lidar_jax.data.cloud_policy import truncation
@@ -25,7 +25,6 @@ from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
 from fcos_lidar_jax.inference import Prediction, load_detector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.inference.stream import only_older
-from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, find_recording
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E
 
@@ -79,11 +78,6 @@ class Detect:
 
 def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
-    if drives := [path for path in args.files if path.exists() and find_recording(path) is not FOLDER]:
-        if len(args.files) > 1:
-            raise ValueError(f"{drives[0]}: got a recording beside other inputs, expected only the recording")
-        stream.run(_as_stream(args), in_lines=False)
-        return
     files, sweeps = _inputs(args.files, args.sweeps)
     if args.full_turn and not any(usual_sensor(file) == KITTI_HDL64E for file in files):
         raise ValueError(f"--full-turn: expected none for {files[0]}: only files of KITTI are cropped")
@@ -126,16 +120,6 @@ def run(args: Detect) -> None:
     removed = write_predictions(detector, clouds, args.out, entries=entries, write=write, **how)
     if line := truncation(removed["truncated"], config):
         tell(line)
-
-
-def _as_stream(args: Detect) -> stream.Stream:
-    """The options for a recording; rejects options that only point files have."""
-    shared = {field.name for field in dataclasses.fields(stream.Stream)}
-    for field in dataclasses.fields(Detect):
-        if field.name not in {*shared, "files"} and getattr(args, field.name) != field.default:
-            raise ValueError(f"{option_name(field.name)}: {args.files[0]}: got a recording, expected point files")
-    given = {name: value for name, value in vars(args).items() if name in shared}
-    return stream.Stream(source=args.files[0], **given)
 
 
 def _inputs(inputs: tuple[Path, ...], listed: Path | None) -> tuple[tuple[Path, ...], list[ListedSweep]]:

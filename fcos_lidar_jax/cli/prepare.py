@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from fcos_lidar_jax.cli.checks import exit_without
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
@@ -50,8 +49,6 @@ class Prepare:
 
 def run(args: Prepare) -> None:
     """Build the index and the database, and print a record of them."""
-    if args.data.data_root is None and args.data.format != "simulated":
-        exit_without("--data-root")
     data, began = args.data.data_set, time.monotonic()
     if not data.on_disk:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")

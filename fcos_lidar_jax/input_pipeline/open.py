@@ -96,6 +96,10 @@ CLASS_MAPS = frozenset(name for reader in READERS for name in reader.class_maps)
 """Names of the class maps of all formats."""
 
 
+class MissingRootError(ValueError):
+    """No folder is given, for a format that needs one."""
+
+
 @dataclasses.dataclass(frozen=True)
 class DataSet:
     """A folder and its format."""
@@ -134,7 +138,7 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
             raise ValueError(f"data root: got {root}, expected none for {format} frames")
         data = DataSet(Path(reader.name), reader)
     elif root is None:
-        raise ValueError("data root: missing, expected the folder of a data set")
+        raise MissingRootError("data root: missing, expected the folder of a data set")
     elif not local_path(root).is_dir():
         raise ValueError(f"{root}: no such folder, expected a data set")
     else:

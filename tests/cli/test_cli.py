@@ -175,8 +175,8 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
         ("detect --checkpoint x --out x", "error: INPUT: got none, expected one, or --sweeps\n"),
         ("stream --checkpoint x --out x", "error: SOURCE: got none, expected one, or --data-root\n"),
         ("evaluate --out x", "error: --checkpoint: got none, expected one, or --results\n"),
-        ("train quickstart --out x", "error: --data-root: got none, expected one, or --format simulated\n"),
-        ("prepare", "error: --data-root: got none, expected one\n"),
+        ("train quickstart --out x", "error: --data-root: got none, expected one\n"),
+        ("prepare --format kitti", "error: --data-root: got none, expected one\n"),
         ("evaluate --results x --out x", "error: --data-root: got none, expected one, or --ground-truth\n"),
     ],
 )
