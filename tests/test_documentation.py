@@ -180,6 +180,15 @@ def test_the_profile_of_the_paper_s_training_starts_and_stops_once(monkeypatch):
     assert calls == ["start_trace", "stop_trace"]
 
 
+def test_the_notebook_imports_what_exists():
+    """``.ci/notebook`` runs it."""
+    cells = json.loads((DOCS / "tutorial.ipynb").read_text())["cells"]
+    lines = "".join("".join(cell["source"]) + "\n" for cell in cells if cell["cell_type"] == "code").splitlines()
+    imports = [line for line in lines if line.startswith("from fcos_lidar_jax")]
+    assert len(imports) > 5
+    exec("\n".join(imports), {})
+
+
 def test_json_of_the_pages_parses():
     for page in PAGES:
         for block in blocks(page, "json"):
