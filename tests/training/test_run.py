@@ -164,6 +164,10 @@ def test_all_documented_metrics_are_recorded(finished):
         assert line["samples_per_second"] == pytest.approx(CONFIG.optimizer.batch_size / line["seconds"])
         assert 0 <= line["waiting_seconds"] <= line["seconds"]
         assert counts <= line.keys()
+    peak = CONFIG.optimizer.peak_learning_rate
+    # The first of four steps is at a tenth of the peak, the second at the peak.
+    np.testing.assert_allclose([line["learning_rate"] for line in steps[:2]], [peak / 10, peak], rtol=1e-5)
+    np.testing.assert_allclose([line["b1"] for line in steps[:2]], [0.95, 0.85], rtol=1e-5)
     assert [(step, "test/mAP" in values) for step, values in finished[3]] == [
         *((1, False), (2, False), (2, True)),
         *((3, False), (4, False), (4, True)),
