@@ -77,10 +77,10 @@ def image_columns(azimuth: Float[Array, "n"], sensor: Sensor) -> tuple[Int32[Arr
     ([1], [True, False])
     """
     clockwise = np.float32(sensor.first_azimuth_rad) - azimuth
-    if sensor.azimuth_limits_rad is not None:
+    if not sensor.is_full_turn:
         clockwise = jnp.mod(clockwise, np.float32(2 * np.pi))
     column = jnp.floor(clockwise * np.float32(1 / sensor.column_rad)).astype(jnp.int32)
-    if sensor.azimuth_limits_rad is None:
+    if sensor.is_full_turn:
         return column % sensor.num_columns, jnp.ones(column.shape, bool)
     return column, column < sensor.num_columns
 

@@ -44,7 +44,7 @@ class Sensor(Checked):
     intensity_scale: _Positive = 1.0  # Factor from the intensity in files to the scale 0-255.
     row_source: Literal["inclination", "laser"] = "inclination"
     """``"inclination"`` bins the inclination of each point; ``"laser"`` reads the row from a sixth point column,
-    for stacked sensors whose inclinations overlap."""
+    for stacked sensors whose inclinations overlap. Its lasers are numbered from the highest down."""
     azimuth_limits_rad: tuple[float, float] | None = None
     """Right and left end of the covered sector, counter-clockwise and at most a turn apart, with the right end in
     [-pi, pi]; None for a full turn. Points outside the sector are dropped."""
@@ -74,6 +74,11 @@ class Sensor(Checked):
         """Width of a column in azimuth."""
         right, left = self.azimuth_limits_rad or (-math.pi, math.pi)
         return (left - right) / self.num_columns
+
+    @property
+    def is_full_turn(self) -> bool:
+        """Whether the columns cover all azimuths, also if the limits say so."""
+        return self.num_columns * self.column_rad > 2 * math.pi - _ROUNDING_RAD
 
     @property
     def num_rows(self) -> int:
@@ -186,7 +191,7 @@ WAYMO_TOP = Sensor(
     forward_rad=0.0,
 )
 """Waymo's top LiDAR, points in the vehicle frame, nominal beam table. Put the table of a real calibration in a
-sensor file."""
+sensor file. Waymo's intensity has no upper limit: store its tanh, which is 0-1 as in KITTI's files."""
 
 ARGOVERSE2 = Sensor(
     "argoverse2",
@@ -198,7 +203,8 @@ ARGOVERSE2 = Sensor(
     row_source="laser",
     forward_rad=0.0,
 )
-"""Argoverse 2: two stacked 32-beam sensors with overlapping inclinations; the row is the laser number 0-63."""
+"""Argoverse 2: two stacked 32-beam sensors with overlapping inclinations; the row is the rank of the laser, which
+the reader finds in each sweep, because the logs number their lasers differently and in no order."""
 
 VLP16 = Sensor("vlp16", even_inclinations(-15.0, 15.0, 16), 1800)
 """Velodyne VLP-16 (Puck) at 10 Hz: 2 degrees between beams, 0.2 degrees between columns (data sheet)."""

@@ -4,9 +4,11 @@ import dataclasses
 import json
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fcos_lidar_jax.geometry import image_columns
 from fcos_lidar_jax.projection import image_cells
 from fcos_lidar_jax.sensors import (
     PRESETS,
@@ -76,6 +78,10 @@ def test_a_sector_can_be_a_whole_turn(middle):
     assert whole.column_rad == pytest.approx(TINY.column_rad)
     moved = in_frame_of(whole, dataclasses.replace(TINY, forward_rad=math.remainder(middle - 1, 2 * math.pi)))
     assert moved.column_rad == pytest.approx(TINY.column_rad)
+    seam = np.float32(whole.first_azimuth_rad) + np.linspace(-3e-6, 3e-6, 13, dtype=np.float32)
+    column, inside = image_columns(jnp.concatenate([seam, seam - np.float32(2 * np.pi)]), whole)
+    assert inside.all()
+    assert set(column.tolist()) <= {0, whole.num_columns - 1}
 
 
 @pytest.mark.parametrize("middle", [math.pi / 2, -math.pi, 7.0])

@@ -75,7 +75,7 @@ class MappedFrames(WrappedFrames):
     def _mapped(self, frame: Frame) -> Frame:
         kept = (labels := self._table[frame.labels]) >= 0
         rows = {"boxes": frame.boxes[kept], "labels": labels[kept], "num_points": frame.num_points[kept]}
-        return dataclasses.replace(frame, **rows)
+        return dataclasses.replace(frame, **rows, others=np.concatenate([frame.others, frame.boxes[~kept]]))
 
     def labels(self, index: int) -> np.ndarray:
         labels = self._table[self.frames.labels(index)]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.point_files import MAX_TIME_LAG_S, check_num_lags, check_time_lags
+from fcos_lidar_jax.data.point_files import MAX_TIME_LAG_S, check_num_lags, check_time_lags, rank_lasers
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
@@ -28,9 +28,10 @@ _MAX_OUTSIDE = 0.3
 _MAX_DENSITY = 1.7
 _MIN_NEIGHBOURS = 0.3
 _MIN_ROWS_FILLED, _MIN_ROWS_DOWN = 0.6, 0.9
-"""The six bounds of :func:`sensor_mismatch`. A sensor's own clouds reach at most 0.17, 0.01, 1.05, and at least
-0.84, 0.96 in a street and 1. For most pairs of presets, one figure lies clearly on the other side; some have beams
-that are too alike."""
+"""The bounds of :func:`sensor_mismatch`. A sensor's own clouds reach at most 0.17, 0.01, 1.05, and at least 0.84,
+0.96 in a street and 1. For most pairs of presets, one figure lies clearly on the other side; some have beams that
+are too alike."""
+_MIN_DESCENDING = 0.7  # share of neighbouring lasers in order; lasers in no order reach a half
 _DOWN_RAD = -0.05  # beams below reach the ground or something before it; others may only see the sky
 
 
@@ -208,7 +209,7 @@ def _limits(sensor: Sensor) -> str:
 
 
 def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
-    """A warning that another sensor probably recorded a cloud, or None.
+    """A warning that another sensor probably recorded a cloud, or that it has no current sweep, or None.
 
     Uses the current sweep: the share of points beyond the sensor's limits and outside its vertical field of view,
     points per image cell, the share of points with a neighbour in the next column and in the next row, of rows
@@ -223,7 +224,10 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     """
     points = _with_columns(points, sensor)
     points = points[usable_rows(points)]
-    points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
+    newest = points[:, 4].min(initial=MAX_TIME_LAG_S)
+    if len(points) and newest > 0:
+        return f"no points of the current sweep: the smallest time lag is {newest:g} s, expected 0"
+    points = points[points[:, 4] == newest]
     points = points[~np.asarray(close_to_sensor(points, sensor, _NEAR_M))]
     if sensor.azimuth_limits_rad is not None:
         x, y = points[:, 0] - sensor.origin_m[0], points[:, 1] - sensor.origin_m[1]
@@ -271,6 +275,11 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     for share, what in ((beside, "column"), (below, "row")):
         if share < _MIN_NEIGHBOURS:
             yield f"{share:.0%} of the points have a neighbour in the next {what}, expected most"
+    if sensor.row_source == "laser":
+        _, one = np.unique(points[:, 5], return_index=True)
+        follows = np.diff(rank_lasers(points, sensor)[one, 5]) > 0
+        if follows.sum() < _MIN_DESCENDING * len(follows):
+            yield f"{follows.mean():.0%} of the lasers lie above the next, expected all: number them from the top"
     in_row, down = filled.sum(axis=1), np.asarray(sensor.inclinations_rad) < _DOWN_RAD
     rows = in_row > in_row.max() / 10
     if rows.mean() < _MIN_ROWS_FILLED and rows[down].sum() < _MIN_ROWS_DOWN * down.sum():

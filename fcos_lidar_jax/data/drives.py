@@ -23,7 +23,7 @@ _FASTEST_M_PER_S = 100.0  # between two poses
 _MAX_GAP_S = 10.0  # between two sweeps
 _MAX_RATIO = 3  # between the numbers of points in two clouds of one sensor
 _LATEST_S = 1e12  # larger values are not timestamps
-_NANOSECOND_DIGITS = range(16, 20)  # file names with this many digits are nanoseconds
+_UNITS_PER_US = {16: 1, **dict.fromkeys((17, 18, 19), 1000)}  # by digits of a name: microseconds, nanoseconds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,7 +208,7 @@ def _time_of(file: Path) -> int | None:
         return None
     if point:
         return int(Decimal(stem) * 1_000_000) if float(stem) < _LATEST_S else None
-    return int(stem) // 1000 if len(stem) in _NANOSECOND_DIGITS else None
+    return int(stem) // unit if (unit := _UNITS_PER_US.get(len(stem))) else None
 
 
 def read_tum(path: Path) -> PoseTrack:

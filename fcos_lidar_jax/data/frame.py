@@ -27,6 +27,7 @@ class Frame:
         labels: i32[m]: index into the ``classes`` of the frame set.
         num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box, -1 if unknown.
         num_close: number of points on the ego vehicle that the reader removed, see :func:`drop_close`.
+        others: f32[k, 9]: boxes of other classes, as far as the data have them: nothing is pasted there.
     """
 
     points: np.ndarray
@@ -34,6 +35,7 @@ class Frame:
     labels: np.ndarray
     num_points: np.ndarray
     num_close: int = 0
+    others: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 9), np.float32))
 
 
 @runtime_checkable

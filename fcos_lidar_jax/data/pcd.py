@@ -13,9 +13,10 @@ from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.progress import tell
 
 _COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "time_lag")}
-_COLUMNS["intensity"] = ("intensity", "reflectivity", "intensities", "remission", "scalar_intensity", "i")
+_COLUMNS["intensity"] = ("reflectivity", "intensity", "intensities", "remission", "scalar_intensity", "i")
 _COLUMNS["laser"] = ("laser_number", "laser", "ring", "line", "channel")
-"""Column -> its field names in various drivers, the most specific first. Other fields are skipped."""
+"""Column -> its field names in various drivers, the most specific first. Ouster's intensity is the signal, and its
+reflectivity is corrected for the distance. Other fields are skipped."""
 _LIKE_INTENSITY = re.compile("intens|refl|remiss|signal|amplitude")
 _NOT_A_NUMBER = re.compile(rb"(?i)-?(?:nan\(\w*\)|1\.#\w*)")  # as Microsoft's C library writes it
 _IDENTITY = "0001000"

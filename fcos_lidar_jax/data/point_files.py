@@ -46,7 +46,8 @@ def read_points(
     ``.pcd.bin`` (nuScenes): float32 x 5 with the intensity (0-255) and the ring. ``.bin`` (KITTI): float32 x 4.
     ``columns`` and ``dtype`` give another raw layout, for any file name; its fifth column is the time lag, except
     in a ``.pcd.bin``, where it stays the ring. ``.npy`` and ``.npz`` (one array, or one named ``points``): N x 3
-    to 6. ``.pcd``: by its header. ``.feather`` (Argoverse 2): columns x, y, z, intensity, laser_number.
+    to 6. ``.pcd``: by its header. ``.feather`` (Argoverse 2): columns x, y, z, intensity, laser_number;
+    see :func:`rank_lasers`.
 
     The size of a raw file cannot distinguish four from five columns, so the file is also refused if its values do
     not look like metres.
@@ -86,7 +87,8 @@ def read_points(
     if kind == ".feather":
         names = ("x", "y", "z", "intensity", "laser_number")
         table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)
-        return assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
+        points = assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
+        return rank_lasers(points, sensor) if sensor.row_source == "laser" else points
     content, max_bytes = _read_whole(path, max_points), max_points * BYTES_PER_POINT
     with refusing(f"{path}: not a readable {kind} file", ValueError):
         if kind == ".pcd":
@@ -125,21 +127,51 @@ def points_from_array(
     return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)), num_sweeps)
 
 
+def rank_lasers(points: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Number the lasers of f32[n, 6] anew, by the median inclination of their points.
+
+    The lowest laser gets the last row. Lasers without points, which see only the sky, count as the highest.
+
+    >>> from fcos_lidar_jax.sensors import ARGOVERSE2
+    >>> points = np.array([[9, 0, 3, 0, 0, 5], [9, 0, -1, 0, 0, 0], [9, 0, 1, 0, 0, 31]], np.float32)
+    >>> rank_lasers(points, ARGOVERSE2)[:, 5].tolist()
+    [61.0, 63.0, 62.0]
+    """
+    usable = np.isfinite(points).all(axis=1)
+    x, y, z = (points[usable, :3] - np.asarray(sensor.origin_m, np.float32)).T
+    inclination = np.arctan2(z, np.hypot(x, y))
+    lasers, of_point = np.unique(points[usable, 5], return_inverse=True)
+    medians = [np.median(inclination[of_point == i]) for i in range(len(lasers))]
+    rows = np.empty(len(lasers), np.float32)
+    rows[np.argsort(medians, kind="stable")[::-1]] = np.arange(sensor.num_rows - len(lasers), sensor.num_rows)
+    ranked = points.copy()
+    ranked[usable, 5] = rows[of_point]
+    return ranked
+
+
 def check_time_lags(lag: np.ndarray, where: Path | str = "points", num_sweeps: int = MAX_SWEEPS) -> None:
-    """Refuse a column that is no time lag: Unix times, a ring, or more different values than sweeps.
+    """Refuse a column that is no time lag in seconds: negative or Unix times, another unit, a ring, or more
+    different values than sweeps.
 
     >>> check_time_lags(np.linspace(0, 1.5, 820), "a.bin")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ValueError: a.bin: fifth column: got 820 different values up to 1.5, expected the time lag in seconds, one ...
     """
+    lag = np.ravel(lag)
+    if len(negative := np.flatnonzero((lag < 0) & np.isfinite(lag))):
+        found = f"{lag[negative[0]]:g} in row {negative[0]}"
+        raise ValueError(f"{where}: time_lag: got {found}, expected seconds of at least 0")
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
     if not lag.size:
         return
-    most = float(lag.max())
-    is_unix = most >= _UNIX_S and np.median(lag) >= _UNIX_S  # a few may be damage
-    if is_unix or (most > 1 and not (lag % 1).any()):
-        kind = "values" if is_unix else "whole numbers"
-        found = f"{kind} up to {most:g}, which look like {'Unix time' if is_unix else 'a ring'}"
+    most = f"up to {lag.max():g}"
+    late = np.count_nonzero(lag > MAX_TIME_LAG_S) > len(lag) / 10  # a few may be damage
+    found = None
+    if late:
+        found = f"values {most}, which look like {'Unix time' if np.median(lag) >= _UNIX_S else 'another unit'}"
+    elif lag.max() >= 1 and not (lag % 1).any():
+        found = f"whole numbers {most}, which look like a ring"
+    if found:
         expected = "the time lag in seconds: leave the column out, or put 0 into it and a ring into a sixth"
         raise ValueError(f"{where}: fifth column: got {found}, expected {expected}")
     check_num_lags(lag, where, num_sweeps)
@@ -268,10 +300,6 @@ def assemble_points(
                 points[:, i] = table[name]
         points[:, 3] *= np.float32(sensor.intensity_scale)
         points *= np.float32(1)  # turns signalling NaNs, which would raise warnings later, into quiet ones
-    negative = np.flatnonzero(points[:, 4] < 0)
-    if len(negative):
-        lag = f"{points[negative[0], 4]:g} in row {negative[0]}"
-        raise ValueError(f"{where}: time_lag: got {lag}, expected seconds of at least 0")
     if sensor.row_source == "laser":
         if "laser" not in table:
             expected = f"one for every point, since sensor {sensor.name} needs it"

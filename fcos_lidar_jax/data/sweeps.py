@@ -16,7 +16,7 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import read_json, refusing
 from fcos_lidar_jax.sensors import Sensor
 
-_GAP_US = (1_000, 10_000_000)  # plausible mean time between sweeps; others are not microseconds
+GAP_US = (1_000, 10_000_000)  # plausible mean time between sweeps; others are not microseconds
 FARTHEST_M = 1e8  # beyond any place on earth in any map's coordinates
 
 Metres = Annotated[float, msgspec.Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
@@ -123,8 +123,8 @@ def read_entries(path: Path) -> list[ListedSweep]:
             raise ValueError(f"{where}.sensor_to_world: got {pose.tolist()}, expected {expected}")
     times = [sweep.timestamp_us for sweep in sweeps]
     gap_us = (max(times) - min(times)) / max(len(sweeps) - 1, 1)
-    if len(sweeps) > 1 and not _GAP_US[0] <= gap_us <= _GAP_US[1]:
-        expected = f"microseconds, {_GAP_US[0]} to {_GAP_US[1]} from sweep to sweep"
+    if len(sweeps) > 1 and not GAP_US[0] <= gap_us <= GAP_US[1]:
+        expected = f"microseconds, {GAP_US[0]} to {GAP_US[1]} from sweep to sweep"
         raise ValueError(f"{path}: timestamp_us: got {gap_us:g} on average, expected {expected}")
     return sweeps
 

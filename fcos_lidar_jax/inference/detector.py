@@ -137,7 +137,7 @@ def _scaled_once(points: Rows, sensor: Sensor, num_sweeps: int) -> np.ndarray:
     rows = points_from_array(points, sensor, num_sweeps=num_sweeps)
     if sensor.intensity_scale == 1:
         return rows
-    if np.count_nonzero(rows[:, 3] > 255) > len(rows) / 2:
+    if np.count_nonzero(rows[:, 3] > 255) > np.count_nonzero(rows[:, 3] > 0) / 2:
         tell(
             "note: intensities are not scaled, since most would exceed 255: they seem to be scaled already",
             once=True,

@@ -18,9 +18,9 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
     """Make the function that samples objects for a frame.
 
     For each class in order, samples without replacement as many objects as the frame lacks, counting the frame's
-    boxes with at least one point. An object that overlaps a box of the frame or an object pasted before is dropped
-    and not replaced. Objects match by class name and need ``min_points`` points to paste, at least one of them
-    from the current sweep; a model of k sweeps gets the points of the newest k sweeps.
+    boxes with at least one point. An object that overlaps a box of the frame, also of another class, or an object
+    pasted before is dropped and not replaced. Objects match by class name and need ``min_points`` points to paste,
+    at least one of them from the current sweep; a model of k sweeps gets the points of the newest k sweeps.
 
     Returns:
         ``(frame, rng) -> (pasted, removed)``: the objects, with their numbers of points of the current sweep, and
@@ -50,15 +50,16 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
     pools = [np.flatnonzero(usable & (labels == label)) for label in range(len(targets))]
 
     def paste(frame: Frame, rng: np.random.Generator) -> tuple[Frame, np.ndarray]:
-        present = np.bincount(frame.labels[frame.num_points != 0], minlength=len(pools))
-        missing = np.maximum(np.array(targets) - present, 0)
+        counts = np.bincount(frame.labels[frame.num_points != 0], minlength=len(pools))
+        missing = np.maximum(np.array(targets) - counts, 0)
         sampled = [
             rng.choice(pool, min(count, len(pool)), replace=False)
             for pool, count in zip(pools, missing, strict=True)
             if count and len(pool)
         ]
         candidates = np.concatenate([np.zeros(0, np.int64), *sampled])
-        rows = candidates[_without_overlap(boxes[candidates], frame.boxes)]
+        present = np.concatenate([frame.boxes, frame.others])
+        rows = candidates[_without_overlap(boxes[candidates], present)]
         columns = frame.points.shape[1]  # a sensor without rows of lasers has no use for their numbers
         clouds = [objects.points(row)[: pasted[row], :columns] for row in rows]
         points = np.concatenate([frame.points[:0], *clouds])

@@ -13,6 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.sensors import ARGOVERSE2
+from fcos_lidar_jax.simulation.frames import make_frame
 
 STEP_NS = 100_000_000
 WORLD = np.array([[712.0, 1310, -20], [706, 1322, -21.5], [731, 1301, -22], [700, 1290, -23]])
@@ -70,7 +73,21 @@ def test_static_points_coincide_in_fused_sweeps_of_a_log(root):
         np.testing.assert_array_equal(points[:, 4], np.repeat(np.arange(ages) * 0.1, 4).astype(np.float32))
         # Half floats hold 30 m to 2 cm.
         np.testing.assert_allclose(points[:, :3], np.tile(in_ego(WORLD, i), (ages, 1)), atol=0.03)
-        np.testing.assert_array_equal(points[:, [3, 5]], np.tile(MEASURED, (ages, 1)))
+        np.testing.assert_array_equal(points[:, 3], np.tile(MEASURED[:, 0], ages))
+
+
+def test_lasers_are_rows_from_the_highest_down_in_any_numbering(tmp_path):
+    points = make_frame(0, ARGOVERSE2, reading=CloudReading(1, "none")).points
+    points[:, :3] = points[:, :3].astype(np.float16)
+    x, y, z = (points[:, :3] - ARGOVERSE2.origin_m).T
+    slopes = {laser: np.median((z / np.hypot(x, y))[points[:, 5] == laser]) for laser in np.unique(points[:, 5])}
+    row = {laser: 63 - sum(other < own for other in slopes.values()) for laser, own in slopes.items()}
+    for seed in range(3):
+        number = np.random.default_rng(seed).permutation(64)[points[:, 5].astype(int)]
+        write_sweep(tmp_path, seed, np.column_stack([points[:, :4], number]))
+        read = read_points(tmp_path / f"sensors/lidar/{seed}.feather", ARGOVERSE2)
+        assert read[:, 5].tolist() == [row[laser] for laser in points[:, 5]]
+        assert np.abs(read[:, 5] - points[:, 5]).max() <= 1  # the simulated lasers are numbered from the top
 
 
 def test_boxes_are_in_the_ego_frame_with_velocities_from_their_tracks(root):

@@ -43,6 +43,7 @@ def test_boxes_of_other_classes_are_dropped_and_counted():
     assert (frame.labels.tolist(), mapped.labels(0).tolist()) == ([2, 0, 0], [0, 0])  # the first box is empty
     assert frame.labels.dtype == np.int32
     assert (frame.boxes[:, 0].tolist(), frame.num_points.tolist()) == ([0, 9, 27], [0, 1, 3])
+    np.testing.assert_array_equal(frame.others, make().frame(0).boxes[2:3])
     assert (len(mapped.frame(1).boxes), mapped.frame(1).num_close, len(mapped.frame(1).points)) == (0, 1, 4)
     assert mapped.left_out() == {"bee": 1, "dog": 1}
     assert MappedFrames(make(), ("dog", "cow", "bee", "ant")).left_out() == {}

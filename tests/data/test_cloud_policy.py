@@ -61,7 +61,7 @@ def test_valid_rows_stay_unchanged():
     ("column", "absurd", "fine"),
     [
         *((column, value, 9.0) for column in range(5) for value in (np.nan, -np.inf)),
-        *((3, 1e30, MAX_INTENSITY), (3, -65_536.0, -1.0), (4, 60.1, MAX_TIME_LAG_S), (4, -0.05, 0.0)),
+        *((3, 1e30, MAX_INTENSITY), (3, -65_536.0, -1.0), (4, 60.1, MAX_TIME_LAG_S)),
     ],
 )
 def test_rows_beyond_physical_limits_are_marked_invalid(column, absurd, fine):
@@ -210,6 +210,9 @@ def test_the_warning_describes_the_mismatch(clouds):
     hdl32e = clouds["nuscenes_hdl32e"]
     millimetres = hdl32e * np.array([1000, 1000, 1000, 1, 1], np.float32)
     shares = hdl32e * np.array([1, 1, 1, 1 / 255, 1], np.float32)
+    upwards, shuffled = (clouds["argoverse2"].copy() for _ in range(2))
+    upwards[:, 5] = 63 - upwards[:, 5]
+    shuffled[:, 5] = np.random.default_rng(0).permutation(64)[shuffled[:, 5].astype(int)]
     for points, sensor, finding in (
         (shares, "short_range", r"no intensity is above 1.*\d\.\d points per cell"),
         (hdl32e, "kitti_hdl64e", "0% of the points have a neighbour in the next row|next column"),
@@ -220,12 +223,15 @@ def test_the_warning_describes_the_mismatch(clouds):
         (shares, "nuscenes_hdl32e", r"expected 0 to 255: multiply them by 255 \(--intensity-scale 255, or "),
         (hdl32e[:, :3], "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255;"),
         (hdl32e * np.array([1, 1, 1, 255, 1]), "nuscenes_hdl32e", "most intensities are above 255, expected 0 to"),
+        (hdl32e + np.array([0, 0, 0, 0, 0.05]), "nuscenes_hdl32e", r"no points of the current .* lag is 0\.05 s"),
+        (upwards, "argoverse2", "0% of the lasers lie above the next, expected all: number them from the top"),
+        (shuffled, "argoverse2", "% of the lasers lie above the next"),
     ):
         assert re.search(finding, sensor_mismatch(points, PRESETS[sensor]) or "")
 
 
 def test_too_few_points_give_no_warning():
-    assert sensor_mismatch(np.ones((400, 5), np.float32) * 9, TINY) is None
+    assert sensor_mismatch(np.ones((400, 4), np.float32) * 9, TINY) is None
     assert sensor_mismatch(np.zeros((0, 3), np.float32), TINY) is None
 
 

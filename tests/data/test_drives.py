@@ -61,6 +61,8 @@ def test_times_that_differ_by_rounding_match(poses, digits):
     (poses / "poses.txt").write_text(f"1700000000.{digits} 4 0 0 0 0 0 1\n")
     [sweep] = drive_of(poses, "1700000000123456789").sweeps
     assert (sweep.time_us, sweep.sensor_to_world[0, 3]) == (1_700_000_000_123_456, 4)
+    (poses / "clouds" / "1700000000123456789.npy").rename(poses / "clouds" / "1700000000123456.npy")
+    assert [sweep.time_us for sweep in drive_of(poses).sweeps] == [1_700_000_000_123_456]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -226,6 +227,12 @@ BAD = {
     "absolute path": (change(D, 3, filename="/etc/passwd"), "data-0-3", "filename", "'/etc/passwd'"),
     "zero-length sweep": (lambda root: (root / SWEEP).write_bytes(b""), "0-3.pcd.bin", "got 0 bytes"),
     "truncated sweep": (lambda root: (root / SWEEP).write_bytes(bytes(1999)), "0-3.pcd.bin", "1999 bytes", "20"),
+    "nanoseconds": (
+        rewrite(D, lambda text: re.sub(r'("timestamp": \d+)', r"\g<1>000", text)),
+        f"{D}.json",
+        "timestamp",
+        "from sweep to sweep, expected microseconds, 1000 to 10000000",
+    ),
     "scene unknown": (lambda root: "lost", "scene-99", "scene.json"),
     "split without scenes": (lambda root: "none", "'none'", "got no keyframe"),
 }

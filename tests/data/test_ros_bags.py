@@ -70,7 +70,7 @@ def test_clouds_of_common_drivers_are_read(tmp_path, driver):
     points = np.frombuffer(rng.bytes(dtype.itemsize * 20), dtype).copy()  # noise in the gaps and in other fields
     values = rng.integers(1, 60, (20, 4))
     laser = next(name for name in ("ring", "line") if name in dtype.names)
-    light = "intensity" if "intensity" in dtype.names else "reflectivity"
+    light = "reflectivity" if "reflectivity" in dtype.names else "intensity"  # of Ouster's both, not the signal
     for name, column in zip(("x", "y", "z", light), values.T, strict=True):
         points[name] = column
     points[laser] = np.arange(20)

@@ -72,6 +72,15 @@ def test_pasted_objects_fill_up_the_classes_without_overlap(objects, seed, num_s
     assert removed.tolist() == np.flatnonzero(inside).tolist()
 
 
+def test_nothing_is_pasted_onto_objects_of_other_classes(objects):
+    frame = toy_frame(100)
+    pasted, _ = pasted_into(frame, objects)
+    others = dataclasses.replace(frame, others=pasted.boxes[:1])
+    again, _ = pasted_into(others, objects)
+    assert [tuple(box[:7]) for box in again.boxes].count(tuple(pasted.boxes[0, :7])) == 0
+    assert len(again.boxes) > 0
+
+
 def test_numbers_of_lasers_are_left_out_if_the_frame_has_none(tmp_path):
     sensor = dataclasses.replace(NUSCENES_HDL32E, row_source="laser")
     frames = InMemoryFrames(tuple(wide(toy_frame(seed)) for seed in range(20)), sensor, NUSCENES_CLASSES)

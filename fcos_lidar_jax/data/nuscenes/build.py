@@ -9,7 +9,7 @@ import numpy as np
 from fcos_lidar_jax.data.nuscenes import tables as kinds
 from fcos_lidar_jax.data.nuscenes.index import Index
 from fcos_lidar_jax.data.nuscenes.tables import R, Row, read_table
-from fcos_lidar_jax.data.sweeps import check_poses
+from fcos_lidar_jax.data.sweeps import GAP_US, check_poses
 
 CHANNEL = "LIDAR_TOP"  # the only sensor that is kept
 
@@ -122,6 +122,10 @@ def _sweeps(tables: _Tables, samples: dict[str, int]) -> Columns:
     for i in np.flatnonzero((previous >= 0) & (times[previous] >= times)):
         problem = f"prev: got {rows[i].prev!r}, expected an earlier sweep"
         raise tables.error(kinds.SampleData, rows[i].token, problem)
+    gaps = (times - times[previous])[previous >= 0]
+    if len(gaps) and not GAP_US[0] <= np.median(gaps) <= GAP_US[1]:
+        found = f"{np.median(gaps):g} from sweep to sweep, expected microseconds, {GAP_US[0]} to {GAP_US[1]}"
+        raise tables.error(kinds.SampleData, rows[0].token, f"timestamp: got {found}")
     key = np.array([row.is_key_frame for row in rows], bool)
     own_sweep = np.full(len(samples), -1, np.int32)
     own_sweep[sample_of[key]] = np.flatnonzero(key)
