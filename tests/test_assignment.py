@@ -1,7 +1,5 @@
 """Compare owners and dynamic K with loops, on random and degenerate input."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -90,13 +88,3 @@ def test_a_diverged_prediction_ranks_last():
     assert targets.positive.tolist() == [False, True, False]
     targets = compute(i32([0, 0, 0]), f32([1, 5, 2]), f32([np.nan, 0.9, 0.9]), num_boxes=1)  # without NaN, K is 2
     assert targets.positive.tolist() == [False, False, True]
-
-
-def test_works_under_vmap():
-    rng = np.random.default_rng(0)
-    owner, cost, iou = i32(rng.integers(-1, 4, (3, 50))), f32(rng.random((3, 50))), f32(rng.random((3, 50)))
-
-    go = functools.partial(compute, num_boxes=4)
-    batched = jax.jit(jax.vmap(go))(owner, cost, iou)
-    for b in range(3):
-        np.testing.assert_array_equal(batched.positive[b], go(owner[b], cost[b], iou[b]).positive)

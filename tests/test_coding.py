@@ -82,12 +82,3 @@ def test_degenerate_predictions_decode_to_finite_boxes_with_finite_gradients(axe
         jnp.array([0, 0, 0, 1e4, -1e4, 0, 0, 1, 0, 0], jnp.float32), jnp.zeros(3), jnp.float32(0)
     )[3:5]
     np.testing.assert_allclose(size, [np.exp(5), np.exp(-5)], rtol=1e-5)
-
-
-@both_axes
-def test_results_are_the_same_under_vmap(axes):
-    boxes, points, azimuth = map(jnp.asarray, samples())
-    numbers = jitted(encode)(boxes, points, azimuth, axes=axes)
-    for function, args in ((encode, (boxes, points, azimuth)), (decode, (numbers, points, azimuth))):
-        of_one = jax.jit(jax.vmap(functools.partial(function, axes=axes)))
-        np.testing.assert_allclose(of_one(*args), jitted(function)(*args, axes=axes), atol=1e-5)

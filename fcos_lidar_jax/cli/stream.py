@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import numpy as np
 import tyro
 
@@ -16,6 +15,7 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import Excludes, Needs, Or, Output, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.sinks import check_results, closing_at_failure, open_sinks
+from fcos_lidar_jax.data.box_geometry import to_world
 from fcos_lidar_jax.data.cloud_policy import truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
@@ -24,7 +24,7 @@ from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, read_boxes, select
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import detect_stream
-from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
+from fcos_lidar_jax.inference.tracks import Tracks, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
 from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, in_frame_of
@@ -36,7 +36,6 @@ _OPTIONS = {
 }
 """Options that not every kind of drive takes, and the names that their functions give them."""
 
-_STAGES: tuple[str, ...] = "reading", "detection", "writing"
 _TRACKED_SCORE = 0.5  # Of boxes with lower scores, most are on no object, and their tracks last for a few sweeps.
 
 
@@ -111,7 +110,7 @@ def run(args: Stream, *, in_lines: bool = True) -> None:
     """
     if args.track and args.min_score is None:
         args = dataclasses.replace(args, min_score=_TRACKED_SCORE)
-    kind = _find(args)
+    kind, began = _find(args), time.monotonic()
     detector = load_detector(args.checkpoint, backend=args.backend)
     classes, sensor, source = detector.classes, detector.sensor, args.source or args.data_root or Path()
     paths = find_clouds((source,)) if kind is FOLDER else [source]
@@ -125,12 +124,11 @@ def run(args: Stream, *, in_lines: bool = True) -> None:
     notes, num_truncated, progress = list[str | None](), 0, Progress("sweeps", None)
     add_tracks = _tracker(classes)
     views = {"title": args.scene or str(args.source), "in_lines": in_lines}
-    with contextlib.ExitStack() as sinks, _Timing() as timing:
+    with contextlib.ExitStack() as sinks:
         sinks.callback(_tell_notes, drive.notes)  # also if the source fails
         add = sinks.enter_context(open_sinks(args, classes, aligned.data, **views))
         with closing_at_failure(sinks, notes) if in_lines else contextlib.nullcontext():
-            for found in detect_stream(_in_order(drive, timing), detector, **how):
-                timing.begin("writing")
+            for found in detect_stream(_in_order(drive), detector, **how):
                 assert found.sweep is not None
                 assert found.cloud is not None
                 kept = select(found.detections, classes, min_score=args.min_score, labels=args.labels)
@@ -143,27 +141,23 @@ def run(args: Stream, *, in_lines: bool = True) -> None:
                 notes.append(found.note)
                 num_truncated += found.cloud.num_truncated
                 progress.show(len(notes), f"{found.sweep.name}: {len(record['boxes'])} boxes")
-                timing.end_sweep()
         if line := unusable_clouds([*filter(None, notes)], len(notes)):
             drive.notes.append(line)
     if line := truncation(num_truncated, detector.config):
         tell(line)
-    tell(timing.summary())
+    tell(f"{len(notes)} sweeps in {time.monotonic() - began:.1f} s")
 
 
-def _in_order(drive: Drive, timing: "_Timing") -> Iterator[Sweep]:
+def _in_order(drive: Drive) -> Iterator[Sweep]:
     """Yield the sweeps; with poses, only sweeps that are later than all earlier ones. A note counts the others."""
     latest_us, others = -math.inf, list[str]()
-    timing.begin("reading")
     try:
         for sweep in drive.sweeps:
-            timing.begin("detection")
             if sweep.time_us <= latest_us:
                 others.append(sweep.name)
             if sweep.time_us > latest_us or not drive.posed:
                 yield sweep
             latest_us = max(latest_us, sweep.time_us)
-            timing.begin("reading")
     finally:
         if others:
             how = "skipped" if drive.posed else "kept, since the order only matters with poses"
@@ -190,43 +184,6 @@ def _tracker(classes: tuple[str, ...]) -> Callable[[list[dict[str, Any]], Sweep]
 def _tell_notes(notes: list[str]) -> None:
     while notes:
         tell(f"note: {notes.pop(0)}")
-
-
-class _Timing(contextlib.AbstractContextManager):
-    """Seconds per sweep and stage, and the number of programs compiled after the first sweep."""
-
-    def __init__(self) -> None:
-        self._seconds, self._programs = [dict.fromkeys(_STAGES, 0.0)], 0
-        self._stage, self._began = "detection", time.perf_counter()
-        jax.monitoring.register_event_duration_secs_listener(self._listen)
-
-    def __exit__(self, *error: object) -> None:
-        jax.monitoring.unregister_event_duration_listener(self._listen)
-
-    def _listen(self, event: str, *_: object, **__: object) -> None:
-        self._programs += event.endswith("/backend_compile_duration")
-
-    def begin(self, stage: str) -> None:
-        """End the stage before and begin another one, which may continue."""
-        now = time.perf_counter()
-        self._seconds[-1][self._stage] += now - self._began
-        self._stage, self._began = stage, now
-
-    def end_sweep(self) -> None:
-        self.begin("detection")
-        if len(self._seconds) == 1:
-            self._programs = 0
-        self._seconds.append(dict.fromkeys(_STAGES, 0.0))
-
-    def summary(self) -> str:
-        """A line with the medians. The first sweep, which includes the compilation, is listed separately."""
-        (first, *others), number = self._seconds[:-1] or [{}], len(self._seconds) - 1
-        if not others:
-            return f"{number} sweeps"
-        medians = {stage: 1e3 * np.median([seconds[stage] for seconds in others]) for stage in _STAGES}
-        later = ", ".join(f"{ms:.1f} ms {stage}" for stage, ms in medians.items())
-        compiled = f"the first, which compiles, {sum(first.values()):.1f} s"
-        return f"{number} sweeps: {compiled}; the others {later} (medians), {self._programs} compilations"
 
 
 def _find(args: Stream) -> Recording:

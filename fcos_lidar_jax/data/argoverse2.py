@@ -90,10 +90,6 @@ class Argoverse2Frames(FrameSet):
     def truth(self, index: int) -> Frame:
         return Frame(no_points(self.sensor), *self._boxes(index))
 
-    def labels(self, index: int) -> np.ndarray:
-        _, labels, num_points = self._boxes(index)
-        return labels[num_points != 0]
-
     def name(self, index: int) -> str:
         """The log's name and the sweep's time in nanoseconds."""
         log, stamp, _ = self._sweeps[index]

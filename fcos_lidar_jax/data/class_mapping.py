@@ -28,12 +28,6 @@ def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None 
     return np.array([-1 if name is None else place.get(name, -1) for name in names], np.int32)
 
 
-def mapped_classes(of: Sequence[str], class_map: ClassMap) -> tuple[str, ...]:
-    """The distinct classes after a class map, in the data's order."""
-    names = (class_map.get(name, name) for name in of)
-    return tuple(dict.fromkeys(name for name in names if name is not None))
-
-
 @dataclasses.dataclass(frozen=True)
 class MappedFrames(WrappedFrames):
     """Frames with labels of other classes, mapped by name; boxes of other classes are left out.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points, unlabelled
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, unlabelled
 from fcos_lidar_jax.data.kitti import camera_calibration, in_camera
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import read_list, read_sweeps
@@ -42,10 +42,6 @@ class CloudFiles(FrameSet):
             how = {"full_turn": self.full_turn, **layout}
             points, num_close = read_cloud(file, self.sensor, self.reading, **how)
         return unlabelled(points, num_close)
-
-    def truth(self, index: int) -> Frame:
-        """A frame without boxes; reads nothing."""
-        return unlabelled(no_points(self.sensor))
 
     def name(self, index: int) -> str:
         return str(self.files[index])

@@ -78,7 +78,7 @@ class FolderFrames(FrameSet):
         """Names of the frames: file names without extension."""
         for name in (_SENSOR, _CLASSES):
             point_files.check_inside(root / name, self._inside, str(root / name))
-        self.sensor = read_sensor(root) if sensor is None else sensor
+        self.sensor = load_sensor(root / _SENSOR) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
             self.names = _read_split(root, splits, split, self._clouds)
@@ -215,11 +215,6 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
     if not os.path.isfile(file):
         raise ValueError(f"{where}: no such file" + ("" if where == str(file) else f": {file}"))
     point_files.check_inside(file, inside, where)
-
-
-def read_sensor(root: Path) -> Sensor:
-    """Read ``sensor.json`` of a folder."""
-    return load_sensor(root / _SENSOR)
 
 
 def _read_split(root: Path, file: str | Path | None, split: str, clouds: Collection[str]) -> tuple[str, ...]:

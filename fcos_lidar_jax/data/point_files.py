@@ -157,17 +157,14 @@ def check_time_lags(lag: np.ndarray, where: Path | str = "points", num_sweeps: i
     Traceback (most recent call last):
     ValueError: a.bin: fifth column: got 820 different values up to 1.5, expected the time lag in seconds, one ...
     """
-    lag = np.ravel(lag)
-    if len(negative := np.flatnonzero((lag < 0) & np.isfinite(lag))):
-        found = f"{lag[negative[0]]:g} in row {negative[0]}"
-        raise ValueError(f"{where}: time_lag: got {found}, expected seconds of at least 0")
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
     if not lag.size:
         return
-    most = f"up to {lag.max():g}"
-    late = np.count_nonzero(lag > MAX_TIME_LAG_S) > len(lag) / 10  # a few may be damage
+    most, few = f"up to {lag.max():g}", lag.size / 10  # a few may be damage
     found = None
-    if late:
+    if np.count_nonzero(lag < 0) > few:
+        found = f"negative values from {lag.min():g} on"
+    elif np.count_nonzero(lag > MAX_TIME_LAG_S) > few:
         found = f"values {most}, which look like {'Unix time' if np.median(lag) >= _UNIX_S else 'another unit'}"
     elif lag.max() >= 1 and not (lag % 1).any():
         found = f"whole numbers {most}, which look like a ring"
@@ -300,6 +297,10 @@ def assemble_points(
                 points[:, i] = table[name]
         points[:, 3] *= np.float32(sensor.intensity_scale)
         points *= np.float32(1)  # turns signalling NaNs, which would raise warnings later, into quiet ones
+    negative = np.flatnonzero(points[:, 4] < 0)
+    if len(negative):
+        lag = f"{points[negative[0], 4]:g} in row {negative[0]}"
+        raise ValueError(f"{where}: time_lag: got {lag}, expected seconds of at least 0")
     if sensor.row_source == "laser":
         if "laser" not in table:
             expected = f"one for every point, since sensor {sensor.name} needs it"

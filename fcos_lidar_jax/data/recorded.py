@@ -4,8 +4,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.data.folder import read_sensor, sensor_file
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
+from fcos_lidar_jax.data.folder import sensor_file
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, load_sensor
 
 RECORDED_BY = {
     "training/velodyne/*.bin": KITTI_HDL64E,
@@ -30,7 +30,7 @@ def recorded_by(paths: Iterable[Path]) -> Sensor | None:
     found: dict[Sensor | None, Path] = {}
     for path in {(path.parent, path.suffix): Path(os.path.abspath(path)) for path in paths}.values():
         file = sensor_file(path)
-        found[usual_sensor(path) if file is None else read_sensor(file.parent)] = path
+        found[usual_sensor(path) if file is None else load_sensor(file)] = path
     if len(found) > 1:
         files = " and ".join(f"{path} of {sensor.name if sensor else 'another'}" for sensor, path in found.items())
         raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")

@@ -159,11 +159,3 @@ def about_z(yaw_rad: float) -> np.ndarray:
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
     return pose
-
-
-def turned(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Rotate points f32[n, c] by a pose f64[4, 4] without its translation; other columns stay."""
-    moved = np.array(points)
-    with np.errstate(over="ignore", invalid="ignore"):  # the cloud policy removes rows that are not finite
-        moved[:, :3] = moved[:, :3] @ pose[:3, :3].T
-    return moved

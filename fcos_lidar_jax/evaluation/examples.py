@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from fcos_lidar_jax.data.box_geometry import to_world
 from fcos_lidar_jax.evaluation.boxes import BoxColumns
 from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation
 from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
@@ -57,14 +58,11 @@ def sensor_boxes(
 
     ``sensor_to_global`` is the pose of the sensor, f64[4, 4]; ``min_score`` is the threshold of the predictions.
     """
-    turn, origin = sensor_to_global[:3, :3], sensor_to_global[:3, 3]
+    from_global = np.linalg.inv(sensor_to_global)
 
     def local(boxes: BoxColumns) -> np.ndarray:
-        heading = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw), 0 * boxes.yaw], axis=1) @ turn
-        velocity = np.pad(boxes.velocity, ((0, 0), (0, 1))) @ turn
-        yaw = np.arctan2(heading[:, 1], heading[:, 0])[:, None]
-        centre = (boxes.translation - origin) @ turn
-        return np.concatenate([centre, boxes.size[:, [1, 0, 2]], yaw, velocity[:, :2]], axis=1)
+        columns = boxes.translation, boxes.size[:, [1, 0, 2]], boxes.yaw, boxes.velocity
+        return to_world(np.column_stack(columns), from_global)
 
     found, truth = evaluation.predictions, evaluation.truth
     found = found.take((found.sample == sample) & (found.score >= min_score))

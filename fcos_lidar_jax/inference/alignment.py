@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from fcos_lidar_jax.data.box_geometry import to_world
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.folder import sensor_file
 from fcos_lidar_jax.data.recorded import check_scale, recorded_by
-from fcos_lidar_jax.data.sweeps import about_z, turned
+from fcos_lidar_jax.data.sweeps import about_z
 from fcos_lidar_jax.geometry import wrap_angle
-from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor, in_frame_of, turn_between
 from fcos_lidar_jax.types import Detections
@@ -49,7 +49,9 @@ class Alignment:
         """Points f32[n, c] of the data in the detector's frame; other columns stay."""
         if (pose := self.pose) is None:
             return points
-        moved = turned(points, pose)
+        moved = np.array(points)
+        with np.errstate(over="ignore", invalid="ignore"):  # the cloud policy removes rows that are not finite
+            moved[:, :3] = moved[:, :3] @ pose[:3, :3].T
         moved[:, :3] += pose[:3, 3]
         return moved
 

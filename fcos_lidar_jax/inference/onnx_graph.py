@@ -30,6 +30,8 @@ from fcos_lidar_jax.types import CHANNELS
 _OPSET, _IR_VERSION = 17, 8  # from 2022, supported by all current runtimes
 _TELEMETRY = "openvino_telemetry"
 _END = np.iinfo(np.int64).max
+INPUTS = "image", "local_geometry"
+"""Names of the tensors that the convolutions take; the second only with local geometry."""
 
 
 def cpu_package(name: str) -> Any:
@@ -75,7 +77,7 @@ def add_network(graph: "Graph", detector: TrainedDetector, features: str) -> dic
         raise ValueError(f"ONNX: got the detector {config.name!r}, expected one on range images")
     layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
     network = _Network(graph, without_second_look(detector.variables), circular=model.circular_width)
-    image = _preprocessing(network, features, model, layout)
+    image = network("Identity", _preprocessing(network, features, model, layout), output=INPUTS[0])
     stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds, len(model.channel_mean)))
     levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks))
     k = len(config.classes)
@@ -312,7 +314,7 @@ def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConf
         times = (network("Gather", image, [8 * rounds + k], axis=1) for k in (r, 0))
         later = network("Concat", offsets_to(others), network("Sub", *times), axis=1)
         channels += [network("Mul", later, both), both]
-    x = network("Concat", *channels, axis=1)
+    x = network("Concat", *channels, axis=1, output=INPUTS[1])
     for layer in range(2):
         gain, shift = network.batch_norm(f"local_geometry/norm{layer}")
         kernel = network.parameter(f"local_geometry/linear{layer}") * gain

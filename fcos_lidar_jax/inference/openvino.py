@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.detector import TrainedDetector
-from fcos_lidar_jax.inference.onnx_graph import cpu_package, network_graph
+from fcos_lidar_jax.inference.onnx_graph import INPUTS, cpu_package, network_graph
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.types import Detections, Outputs, RangeImage
 
@@ -70,24 +70,43 @@ def processor_precision() -> Precision:
 def with_openvino(detector: TrainedDetector, *, precision: Precision | None = None) -> OpenVinoDetector:
     """Compile the network of a detector with OpenVINO, for one cloud at a time, on the CPU in one process.
 
-    ``precision`` applies to the network except its input and outputs; by default :func:`processor_precision`.
+    ``precision`` applies to the convolutions; by default :func:`processor_precision`. Positions and the offsets
+    between them are always float32: at 40 m, bfloat16 has steps of 0.25 m.
     """
     if jax.default_backend() != "cpu" or jax.process_count() > 1:
         found = f"{jax.process_count()} processes on {jax.default_backend()}"
         raise ValueError(f"backend openvino: found {found}, expected one on cpu")
     graph = network_graph(detector)
     precision = precision or processor_precision()
-    openvino = cpu_package("openvino")
-    core = openvino.Core()
+    core = cpu_package("openvino").Core()
     model = core.read_model(graph)
     (features,) = model.inputs
     model.reshape([1, *(size.get_length() for size in features.partial_shape[1:])])
-    options = {"INFERENCE_PRECISION_HINT": _HINT[precision], "PERFORMANCE_HINT": "LATENCY"}
-    request = core.compile_model(model, "CPU", options).create_infer_request()
+
+    def compiled(part: Any, precision: Precision) -> Any:
+        options = {"INFERENCE_PRECISION_HINT": _HINT[precision], "PERFORMANCE_HINT": "LATENCY"}
+        return core.compile_model(part, "CPU", options).create_infer_request()
+
+    inputs, rest = _parts(model)
+    prepare, convolve = compiled(inputs, "float32"), compiled(rest, precision)
 
     def network(image: RangeImage) -> Outputs:
-        # The input is shared. Outputs are copied, because the next cloud overwrites them.
-        outputs = request.infer([np.asarray(image.features)[None]], share_inputs=True)
+        # Inputs are shared. Outputs are copied, because the next cloud overwrites them.
+        prepared = prepare.infer([np.asarray(image.features)[None]], share_inputs=True, share_outputs=True)
+        outputs = convolve.infer([*prepared.values()], share_inputs=True)
         return Outputs(*(outputs[name][0] for name in ("logits", "regression", "iou_logits")))
 
     return OpenVinoDetector(detector.model, detector.variables, precision, network)
+
+
+def _parts(model: Any) -> tuple[Any, Any]:
+    """Split a model into the computation of the convolutions' inputs, and everything after it."""
+    openvino = cpu_package("openvino")
+    tensors = {name: output for op in model.get_ordered_ops() for output in op.outputs() for name in output.names}
+    ends = [tensors[name] for name in INPUTS if name in tensors]
+    inputs, parameters = openvino.Model(ends, model.get_parameters()).clone(), []
+    for end in ends:
+        parameters.append(openvino.opset13.parameter(end.shape, end.element_type))
+        for target in end.get_target_inputs():
+            target.replace_source_output(parameters[-1].output(0))
+    return inputs, openvino.Model(model.get_results(), parameters)

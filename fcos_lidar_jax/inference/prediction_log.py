@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from fcos_lidar_jax import __version__
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.data.cloud_policy import unusable_clouds
 from fcos_lidar_jax.data.frame import FrameSet
@@ -156,9 +157,9 @@ def _sum_over_processes(counts: list[int]) -> list[int]:
 
 
 def detections_fingerprint(detector: CloudDetector, *others: object) -> str:
-    """Checksum of everything detections depend on: weights, configuration, sensor, and other values, as JSON."""
+    """Checksum of everything detections depend on: weights, configuration, sensor, versions, and other values."""
     inputs = detector.fingerprint, config_to_json(detector.config), sensor_to_json(detector.sensor), *others
-    return checksum(json.dumps(inputs, sort_keys=True).encode())
+    return checksum(json.dumps((__version__, jax.__version__, *inputs), sort_keys=True).encode())
 
 
 def _fingerprint(detector: CloudDetector, frames: FrameSet, *how: object) -> str:

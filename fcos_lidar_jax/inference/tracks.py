@@ -35,7 +35,7 @@ def track(
 
     Args:
         tracks: tracks of the previous time.
-        boxes: f32[m, 9], ``x, y, z, l, w, h, yaw, vx, vy`` in a static coordinate frame, see :func:`to_world`;
+        boxes: f32[m, 9], ``x, y, z, l, w, h, yaw, vx, vy`` in a static coordinate frame;
             unknown (NaN) velocities count as 0.
         labels, scores: i32[m], f32[m].
         dt: seconds since the previous time.
@@ -74,18 +74,3 @@ def track(
         tracks.next_id + int(new.sum()),
     )
     return after, ids[np.argsort(order)]
-
-
-def to_world(boxes: np.ndarray, sensor_to_world: np.ndarray) -> np.ndarray:
-    """Transform boxes f32[m, 9] from the frame of a sensor to the world, f64[m, 9]; ignores the tilt of headings.
-
-    >>> quarter = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    >>> to_world(np.array([[10.0, 0, 0, 4, 2, 1, 0, 8, 0]]), quarter).round(4).tolist()
-    [[5.0, 10.0, 0.0, 4.0, 2.0, 1.0, 1.5708, 0.0, 8.0]]
-    """
-    world, turn = np.array(boxes, np.float64), sensor_to_world[:3, :3]
-    world[:, :3] = world[:, :3] @ turn.T + sensor_to_world[:3, 3]
-    heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=-1) @ turn[:2, :2].T
-    world[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
-    world[:, 7:9] = world[:, 7:9] @ turn[:2, :2].T
-    return world

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from fcos_lidar_jax.config import Config
@@ -126,7 +125,6 @@ def make_batches(
     num_processes: int = 1,
     threads: int | None = None,
     workers: int = 0,
-    lend: bool = False,
     order: SampleOrder | None = None,
 ) -> Iterator[Iterator[HostBatch]]:
     """Context manager that yields a run's batches, prepared ahead; leaving it stops threads and workers.
@@ -141,8 +139,8 @@ def make_batches(
         num_processes: of n processes, process i gets the rows i * B / n to (i + 1) * B / n of each batch.
         threads: threads per process that prepare batches, 0 to prepare on demand; default: see
             :func:`default_threads`. At most one batch more than threads is in progress or waiting.
-        lend: leave batches of workers in shared memory instead of copying them. Do not keep their arrays then:
-            the workers need the memory, and it must be released before the process ends.
+        workers: processes that prepare batches, 0 for threads of this process. Do not keep the arrays of their
+            batches: they lie in shared memory, which must be released before the process ends.
 
     Yields:
         an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows; it raises the errors of
@@ -160,9 +158,7 @@ def make_batches(
         fade_step=num_steps - config.fade_epochs * -(-order.epoch_size // size),
         paste=make_paste(objects, config) if objects is not None and config.copy_paste is not None else None,
     )
-    prepared = _prepared(batch_of, first_step, num_steps, threads, workers)
-    owned = _OwnedBatches(prepared, copied=workers > 0 and not lend)
-    with contextlib.closing(prepared), contextlib.closing(owned) as batches:
+    with contextlib.closing(_prepared(batch_of, first_step, num_steps, threads, workers)) as batches:
         yield batches
 
 
@@ -222,23 +218,3 @@ def _check_shared_memory(config: Config, workers: int, num_processes: int) -> No
             f"workers: got {workers}, for which {folder} has {free >> 20} MiB free, expected {needed >> 20} MiB; "
             f"threads need no shared memory"
         )
-
-
-class _OwnedBatches:
-    """Copies batches out of the workers' shared memory.
-
-    Not a generator, because it is closed while a thread may still be waiting in it for a batch.
-    """
-
-    def __init__(self, batches: Iterator[HostBatch], *, copied: bool) -> None:
-        self._batches, self._copied = batches, copied
-
-    def __iter__(self) -> Iterator[HostBatch]:
-        return self
-
-    def __next__(self) -> HostBatch:
-        host = next(self._batches)
-        return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch)) if self._copied else host
-
-    def close(self) -> None:
-        self._batches = iter(())

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import argoverse2, kitti
-from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes
+from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import default_index
@@ -244,8 +244,6 @@ def open_frames(
     Traceback (most recent call last):
     ValueError: ...: no known data set, expected one of ...
     """
-    for path in filter(None, (root, index, splits)):
-        local_path(path)
     data = find_data_set(root, format, version)
     given: dict[str, Any] = {
         "index": index,
@@ -272,7 +270,8 @@ def open_frames(
     frames = open_with(sensor=sensor)
     if class_map is None:
         return frames
-    return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
+    names = (class_map.get(name, name) for name in frames.classes)
+    return MappedFrames(frames, tuple(dict.fromkeys(name for name in names if name is not None)), class_map)
 
 
 def _recording_sensor(data: DataSet, sensor: Sensor | None, intensity_scale: float | None) -> Sensor | None:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
 from fcos_lidar_jax.data.drives import Drive, folder_drive
@@ -24,22 +25,10 @@ class Recording:
 
 
 def _scene_drive(
-    root: Path,
-    _: Sensor,
-    *,
-    scene: str,
-    version: str | None = None,
-    index: Path | None = None,
-    keyframes: bool = False,
-    num_sweeps: int = 1,
-    allow_missing_sweeps: bool = False,
-    follow_links: bool = False,
+    root: Path, _: Sensor, *, scene: str, version: str | None, keyframes: bool, num_sweeps: int, **options: Any
 ) -> Drive:
     """A scene of nuScenes; with ``keyframes``, the sweeps between them are only read if they are fused."""
-    version = find_data_set(root, "nuscenes", version).version
-    data = NuScenes(
-        root, version, index=index, allow_missing_sweeps=allow_missing_sweeps, follow_links=follow_links
-    )
+    data = NuScenes(root, find_data_set(root, "nuscenes", version).version, **options)
     tokens = data.keyframe_tokens(scene)
     only_keyframes = keyframes and num_sweeps == 1
     skipped, number = (0, 0) if only_keyframes else data.skipped_sweeps(scene)

@@ -61,7 +61,7 @@ def convolve(
     )
     how: dict[str, Any] = {"sizes": kernel.shape[:2], "dilation": dilation, "padding": (high, wide)}
     forms = {}
-    if stride == 1 and _multiply_adds(x, kernel) >= LOOP * LARGE:
+    if stride == 1 and x.shape[1] * x.shape[2] * kernel.size >= LOOP * LARGE:  # multiply-adds per image
         forms["cpu"] = functools.partial(_by_rows, **how)
     if stride == 1 and dilation > 1:
         forms["default"] = functools.partial(_by_phases, **how, precision=precision)
@@ -80,7 +80,8 @@ def pointwise(
     kernel = kernel.astype(x.dtype)
     product = functools.partial(_of_pixels, stride=stride, dtype=dtype or x.dtype, precision=precision)
     num_outputs = math.prod(-(-size // stride) for size in x.shape[1:3])
-    forms = {"cpu": functools.partial(_flat, stride=stride)} if num_outputs * kernel.size >= LARGE else {}
+    large = isinstance(num_outputs, int) and num_outputs * kernel.size >= LARGE  # or symbolic, in an export
+    forms = {"cpu": functools.partial(_flat, stride=stride)} if large else {}
     return _with_weight_gradient(product, forms, x, kernel)
 
 
@@ -99,11 +100,6 @@ def _of_pixels(x: Image, kernel: Array, stride: int, dtype: DTypeLike, precision
     # On GPUs, XLA fuses matrix products with neighbouring operations and fails for some: it aborts if there is a
     # stride (triton_tiling_propagation.cc: Check failed) and finds no tiles for others on an A100 (jaxlib 0.10.2).
     return lax.platform_dependent(x, kernel, cpu=matrix_product, default=convolution)
-
-
-def _multiply_adds(x: Image, kernel: Array) -> int:
-    """Multiply-adds per image at stride 1."""
-    return x.shape[1] * x.shape[2] * kernel.size
 
 
 def _with_weight_gradient(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fcos_lidar_jax.initialization import kernel_init
-from fcos_lidar_jax.models.convolution import Image, pointwise
+from fcos_lidar_jax.models.convolution import FULL, Image, pointwise
 from fcos_lidar_jax.models.layers import BatchNorm
 from fcos_lidar_jax.types import CHANNELS
 
@@ -142,6 +142,7 @@ class LocalGeometry(nn.Module):
         x = jnp.concatenate(parts, axis=-1)
         for layer, width in enumerate((HIDDEN, self.features)):
             kernel = self.param(f"linear{layer}", kernel_init, (x.shape[-1], width))
-            (x,) = BatchNorm(name=f"norm{layer}")([pointwise(x, kernel)], train=train)
+            x = pointwise(x, kernel, precision=None if layer else FULL)
+            (x,) = BatchNorm(name=f"norm{layer}")([x], train=train)
             x = jax.nn.relu(x)
         return x

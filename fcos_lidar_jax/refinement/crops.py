@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float32
 
 from fcos_lidar_jax.forms import in_form
-from fcos_lidar_jax.refinement.types import Crops
+from fcos_lidar_jax.refinement.types import LONGEST_M, Crops
 
 _WORD = 32  # Bits of a word.
 _ROW_BITS = 24  # Bits of the row of a point; the remaining 40 of a 64-bit word are its hash.
@@ -21,7 +21,6 @@ def crop_points(
     *,
     num_points: int,
     margin_m: float,
-    limit_m: float = 25.0,
 ) -> Crops:
     """Points inside of boxes that are enlarged by a margin on every side.
 
@@ -34,7 +33,6 @@ def crop_points(
         boxes: ``x, y, z, l, w, h, yaw, ...``.
         num_points: p, maximum number of points per box (static).
         margin_m: metres added on each side of a box (static).
-        limit_m: longer sides count as this long, metres (static).
 
     >>> car = jnp.array([[10.0, 0, 0, 4, 2, 1.5, jnp.pi / 2]])
     >>> cloud = jnp.array([[10.0, 1, 0, 7, 0], [10, 9, 0, 7, 0]])
@@ -53,7 +51,7 @@ def crop_points(
     order = _order(points, usable)
     points = points[order]
     usable = jnp.arange(points.shape[0]) < usable.sum()
-    half = jnp.minimum(boxes[:, 3:6], limit_m) / 2 + margin_m
+    half = jnp.minimum(boxes[:, 3:6], LONGEST_M) / 2 + margin_m
     frame = jnp.cos(boxes[:, 6]), jnp.sin(boxes[:, 6])
 
     position = jnp.where(usable[:, None], points[:, :3], _FAR_M).reshape(num_words, _WORD, 3)

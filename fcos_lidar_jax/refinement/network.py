@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 
 from fcos_lidar_jax.geometry import atan2, safe_norm
 from fcos_lidar_jax.initialization import kernel_init
-from fcos_lidar_jax.refinement.types import Crops, LookInputs, Neighbours
+from fcos_lidar_jax.refinement.types import LONGEST_M, Crops, LookInputs, Neighbours
 
 REACH_M = 10.0
 """Largest distance of a neighbour on the ground."""
@@ -18,13 +18,13 @@ _FAR_M = 1e6  # Distance of boxes that are no neighbours.
 _FULL = lax.Precision.HIGHEST  # Positions would be rounded to TF32 or bfloat16 otherwise.
 
 
-def point_features(crops: Crops, boxes: Float32[Array, "m c"], limit_m: float = 25.0) -> Float32[Array, "m p 14"]:
+def point_features(crops: Crops, boxes: Float32[Array, "m c"]) -> Float32[Array, "m p 14"]:
     """Features of the points: position, distances to the six faces, intensity, fine position, time lag.
 
     A PointNet cannot see the size of the box in positions only, hence the distances to its faces (LiDAR R-CNN).
     Zero in slots without a point.
     """
-    half = jnp.minimum(boxes[..., None, 3:6], limit_m) / 2
+    half = jnp.minimum(boxes[..., None, 3:6], LONGEST_M) / 2
     place, intensity, lag = crops.points[..., :3], crops.points[..., 3:4], crops.points[..., 4:5]
     parts = [place, place + half, half - place, intensity / 255, jnp.arcsinh(place / _FINE_M), lag]
     return jnp.where(crops.valid[..., None], jnp.concatenate(parts, axis=-1), 0.0)

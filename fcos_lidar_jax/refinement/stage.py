@@ -103,18 +103,6 @@ def proposal_inference(config: Config) -> InferenceConfig:
     return dataclasses.replace(config.inference, nms_across_classes=False, max_detections=number)
 
 
-def best_boxes(boxes: Boxes, number: int) -> Boxes:
-    """The best of the boxes, padded where there are fewer.
-
-    >>> boxes = jnp.ones((3, 9)), jnp.array([0.9, 0.5, 0.1]), jnp.array([0, 1, 0]), jnp.ones(3, bool)
-    >>> best_boxes(boxes, 2)[1].tolist()
-    [0.8999999761581421, 0.5]
-    """
-    missing = max(0, number - len(boxes[0]))
-    cut = [jnp.pad(part[:number], ((0, missing), *[(0, 0)] * (part.ndim - 1))) for part in boxes]
-    return cut[0], cut[1], cut[2], cut[3]
-
-
 def look_inputs(config: Config, sensor: Sensor, points: Array, valid: Array, boxes: Boxes) -> LookInputs:
     """Features of points, boxes and neighbours of one cloud; ranges and rays begin at the sensor."""
     refinement = _config_of(config)
@@ -144,18 +132,19 @@ def refine_boxes(
     valid: Array,
     *boxes: Array,
 ) -> Boxes:
-    """Score the best boxes of one cloud anew, and move them; boxes beyond ``num_boxes`` are dropped.
+    """Score the boxes of one cloud anew, and move them.
 
     Args:
         variables: ``params`` of the detector, with the second look's.
         points, valid: the cloud, f32[n, c] and bool[n].
-        boxes: boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d] after NMS, best first.
+        boxes: boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d] after NMS with
+            :func:`proposal_inference`, best first.
 
     Returns:
         ``inference.max_detections`` boxes, scores, labels and their mask, best first; zero where invalid.
     """
     refinement = _config_of(config)
-    place, scores, labels, used = best_boxes((boxes[0], boxes[1], boxes[2], boxes[3]), refinement.num_boxes)
+    place, scores, labels, used = boxes
     with jax.named_scope("refine"):
         looked = look_inputs(config, sensor, points, valid, (place, scores, labels, used))
         logits, residual = look(network, variables, looked)

@@ -5,6 +5,8 @@ import dataclasses
 import jax
 from jaxtyping import Array, Bool, Float32, Int32
 
+LONGEST_M = 25.0  # Longer sides of boxes count as this long.
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

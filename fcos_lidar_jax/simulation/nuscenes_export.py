@@ -58,11 +58,6 @@ def _shard(root: Path, index: int) -> Path:
     return root / _SHARDS / scene_name(index)
 
 
-def _write_text(path: Path, text: str) -> None:
-    with naming(path):
-        path.write_text(text, encoding="utf-8")
-
-
 def _write_scenes(spec: DatasetSpec, root: Path, workers: int, report: Callable[[int], object]) -> None:
     for folder in (f"samples/{CHANNEL}", f"sweeps/{CHANNEL}", Path(MAP_FILE).parent):
         (root / folder).mkdir(parents=True, exist_ok=True)
@@ -85,13 +80,13 @@ def _write_scene(shared: tuple[DatasetSpec, Path, Callable[[], object]], index: 
     rows = render_scene(spec, index, root, advance)
     with atomic_folder(_shard(root, index)) as folder:
         for name, table in rows.items():  # the text of the final table without its brackets
-            _write_text(folder / f"{name}.json", json.dumps(table, indent=0)[1:-1].strip("\n"))
+            atomic_write(folder / f"{name}.json", json.dumps(table, indent=0)[1:-1].strip("\n"))
     return spec.sweeps
 
 
 def _write_tables(spec: DatasetSpec, root: Path) -> None:
     """Write all tables from the rows of the scenes, one scene in memory at a time."""
-    _write_text(root / MAP_FILE, "")
+    atomic_write(root / MAP_FILE, "")
     with atomic_folder(root / spec.version) as folder:
         for name in [file.name for file in _shard(root, 0).iterdir()]:
             texts = ((_shard(root, i) / name).read_text(encoding="utf-8") for i in range(spec.scenes))
@@ -102,8 +97,8 @@ def _write_tables(spec: DatasetSpec, root: Path) -> None:
                 table.write("\n]\n")
         logs = [row["token"] for row in json.loads((folder / "log.json").read_text())]
         for name, rows in fixed_tables(logs).items():
-            _write_text(folder / f"{name}.json", json.dumps(rows, indent=0) + "\n")
-        _write_text(folder / "splits.json", json.dumps(splits(spec.scenes), indent=1) + "\n")
+            atomic_write(folder / f"{name}.json", json.dumps(rows, indent=0) + "\n")
+        atomic_write(folder / "splits.json", json.dumps(splits(spec.scenes), indent=1) + "\n")
 
 
 def splits(scenes: int) -> dict[str, list[str]]:

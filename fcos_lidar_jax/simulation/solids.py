@@ -35,16 +35,8 @@ def make_solids(kind: int, center: object, half: object, **fields: object) -> np
     """
     center = np.atleast_2d(np.asarray(center, np.float64))
     solids = np.zeros(len(center), SOLID)
-    values = {
-        "lean": 0.0,
-        "taper": 1.0,
-        "albedo": 0.3,
-        "density": np.inf,
-        "gloss": 0.0,
-        "owner": SCENERY,
-        **fields,
-    }
-    for name, value in {"kind": kind, "center": center, "half": half, **values}.items():
+    defaults = {"taper": 1.0, "albedo": 0.3, "density": np.inf, "owner": SCENERY}
+    for name, value in {"kind": kind, "center": center, "half": half, **defaults, **fields}.items():
         solids[name] = value
     return solids
 

@@ -22,19 +22,14 @@ def draw_metrics(folder: Path) -> None:
         draw_curves(folder / "scores.png", scores, x_label="step", y_label="", title="test frames")
 
 
-def draw_predictions(
-    folder: Path, predictions: Iterable[Prediction], frames: FrameSet, *, prefix: str, title: str
-) -> list[Path]:
-    """Draw frames from above, with their truth and the detections that reach a score; one picture per prediction.
-
-    ``prefix`` and ``title`` begin the names and the titles of the pictures, before the numbers of their frames.
-    """
+def draw_predictions(folder: Path, predictions: Iterable[Prediction], frames: FrameSet, step: int) -> list[Path]:
+    """Draw test frames from above, with their truth and the detections that reach a score; returns the files."""
     from fcos_lidar_jax.visualization.bev import draw_bev
 
     paths = []
     for prediction in predictions:
         frame = prediction.frame or frames.frame(prediction.index)
-        paths.append(folder / f"{prefix}_{prediction.index}.png")
+        paths.append(folder / f"step_{step:06d}_frame_{prediction.index}.png")
         draw_bev(
             frame.points,
             paths[-1],
@@ -42,6 +37,6 @@ def draw_predictions(
             classes=frames.classes,
             detections=confident(prediction.detections, SHOWN_SCORE),
             truth=(frame.boxes, frame.labels),
-            title=f"{title} {prediction.index}: scores of at least {SHOWN_SCORE}, truth dashed",
+            title=f"step {step}, test frame {prediction.index}: scores of at least {SHOWN_SCORE}, truth dashed",
         )
     return paths

@@ -267,9 +267,11 @@ def _initial_weights(
     if not same:
         variables = _for_other_classes(folder, classes, variables, detector, seed)
     check_arrays(folder, shapes, variables, whose=whose)
-    own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
-    for name, was, now in _differences(own, new, "model"):
-        tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
+    own, new = map(config_to_json, (checkpoint.config, detector.config))
+    shared = {field.name for field in dataclasses.fields(Config)} - {"model"}
+    for part in sorted(own.keys() - shared):  # of the network, also of another detector's
+        for name, was, now in _differences(own[part], new[part], part):
+            tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
     for line in _sensor_differences(checkpoint.sensor, detector.sensor):
         tell(f"warning: {folder}: weights trained {line}: expect scores to fall at first")
     return variables

@@ -114,7 +114,6 @@ def _train(
         num_processes=jax.process_count(),
         threads=spec.threads,
         workers=spec.workers,
-        lend=True,
         order=run.order,
     )
     request: StopRequest | None = None  # none while the first step is compiled: there is nothing to save
@@ -236,8 +235,7 @@ def _evaluate(run: Run, number: int, state: TrainState, log: MetricsLog | None) 
     examples = list(predict(trained, tests, indices=first, devices=devices))
     if log is not None:
         tell(f"step {number}: mAP by centre distance {score:.3f}")
-        prefix, title = f"step_{number:06d}_frame", f"step {number}, test frame"
-        pictures = draw_predictions(run.spec.out / "pictures", examples, tests, prefix=prefix, title=title)
+        pictures = draw_predictions(run.spec.out / "pictures", examples, tests, number)
         log.write_pictures(number, pictures)
         if not math.isnan(score):
             run.checkpoints.record_score(number, score)

@@ -62,9 +62,9 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
     """Make the gradient of the loss of a batch, in ``config.optimizer.accumulate`` micro-batches.
 
     Sums of losses are divided by the counts over all micro-batches and devices, so the number of micro-batches
-    does not change any weight; only batch norm sees smaller batches. With several micro-batches, the counts are
-    known only after the last one, so each count, such as positives and boxes of the second look, has a gradient of
-    its own.
+    does not change any weight, except with several groups of CenterPoint; batch norm sees smaller batches. With
+    several micro-batches, the counts are known only after the last one, so each count, such as positives and boxes
+    of the second look, has a gradient of its own.
 
     Returns:
         pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``. The gradient has the trainable

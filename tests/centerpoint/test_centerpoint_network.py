@@ -10,11 +10,13 @@ from tiny_peer import CONFIG
 from tiny_run import SENSOR, untrained
 
 from fcos_lidar_jax.centerpoint.network import Neck, from_channels
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, CENTERPOINT_PILLARS, COMPACT
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.training.plan import _initial_weights
 
 
 @pytest.fixture(scope="module")
@@ -129,3 +131,12 @@ def test_points_are_taken_in_full_float32_precision(scene):
     assert len(full) == 1 < len(products)
     assert "x10xf32>, tensor<10x" in full[0]  # the ten features of the points
     assert not any("HIGHEST" in line for line in program if "stablehlo.convolution" in line)
+
+
+def test_weights_of_other_pillars_are_reported(tmp_path, capsys):
+    save_checkpoint(tmp_path / "other", Checkpoint(CONFIG, SENSOR, untrained(CONFIG, SENSOR), 1))
+    half = dataclasses.replace(CONFIG.pillars, range_m=12.8, pillar_m=0.4)
+    _initial_weights(build_detector(dataclasses.replace(CONFIG, pillars=half), SENSOR), tmp_path / "other")
+    told = capsys.readouterr().err
+    assert "weights of pillars.pillar_m 0.8, to be trained with 0.4\n" in told
+    assert "weights of pillars.range_m 25.6, to be trained with 12.8\n" in told

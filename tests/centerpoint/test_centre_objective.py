@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_peer import CONFIG, host_batch
+from tiny_peer import CONFIG
 from tiny_run import SENSOR, untrained
 
 from fcos_lidar_jax.centerpoint.centres import centre_targets, decode_centres, encode_centres, focal_loss

@@ -164,6 +164,9 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
     assert counts["kept_by_round"] == filled.sum((0, 1)).tolist()
     assert counts["num_close"] == 0  # as configurations read the current sweep
     assert png.stat().st_size > 10_000
+    command("project", home / "nan.npy", "--out", out, "--sensor nuscenes_hdl32e")
+    assert "warning: " in (told := capsys.readouterr().err)
+    assert "points do not fit sensor 'nuscenes_hdl32e'" in told
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_results_against_a_file_of_truth_and_against_the_tables(home, by_tables,
         assert summary.pop("eval_time") > 0
     assert json.dumps(summaries[0]) == json.dumps(summaries[1]) == json.dumps(expected)
     assert {path.name for path in tmp_path.iterdir()} == FILES
-    assert read(tmp_path / "results_nusc.json") == read(results) or "NaN" in results.read_text()
+    assert read(tmp_path / "results_nusc.json") == read(results)
     assert f"NDS {expected['nd_score']:.4f}  mAP {expected['mean_ap']:.4f}  on 6 samples" in printed.out
     assert re.search(r"warning: .*rotation: normalised", printed.err)
 
@@ -107,18 +107,12 @@ def test_the_report_shows_the_metrics_of_the_summary(by_tables):
     assert page.count("data:image/png;base64,") == 26
     cells = re.findall(r"<td>([^<]*)</td>", text[text.index("<body>") :])
     numbers = {cell for cell in cells if re.fullmatch(r"\d+\.\d{3}", cell)}
-    assert numbers <= {f"{value:.3f}" for value in leaves(summary) if isinstance(value, float)}
+    assert numbers <= {f"{value:.3f}" for value in leaves(summary).values() if isinstance(value, float)}
     for value in (summary["nd_score"], summary["mean_ap"], *summary["tp_errors"].values()):
         assert f"{value:.3f}" in numbers
     spans = {f"{drawn[key]['low']:.3f} to {drawn[key]['high']:.3f}" for key in ("nd_score", "mean_ap")}
     assert spans == {cell for cell in cells if " to " in cell}
     assert drawn["mean_ap"]["low"] <= summary["mean_ap"] <= drawn["mean_ap"]["high"]
-
-
-def leaves(value):
-    if isinstance(value, dict):
-        return [leaf for part in value.values() for leaf in leaves(part)]
-    return [value]
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def test_valid_rows_stay_unchanged():
     ("column", "absurd", "fine"),
     [
         *((column, value, 9.0) for column in range(5) for value in (np.nan, -np.inf)),
-        *((3, 1e30, MAX_INTENSITY), (3, -65_536.0, -1.0), (4, 60.1, MAX_TIME_LAG_S)),
+        *((3, 1e30, MAX_INTENSITY), (3, -65_536.0, -1.0), (4, 60.1, MAX_TIME_LAG_S), (4, -0.05, 0.0)),
     ],
 )
 def test_rows_beyond_physical_limits_are_marked_invalid(column, absurd, fine):

@@ -21,7 +21,6 @@ from fcos_lidar_jax.data.kitti import (
     read_labels,
     to_lidar,
 )
-from fcos_lidar_jax.input_pipeline.open import open_frames
 from fcos_lidar_jax.sensors import KITTI_HDL64E, TINY
 
 UPRIGHT = Rotation.from_euler("y", 0.8, degrees=True).as_matrix()  # about the camera's vertical
@@ -156,16 +155,12 @@ def test_yaws_of_frames_are_in_half_open_turns(root):
     assert -np.pi <= KittiFrames(root).frame(1).boxes[0, 6].astype(float) < np.pi
 
 
-def test_types_are_classes_and_map_to_nuscenes(root):
+def test_types_are_classes(root):
     kinds = [*CLASSES, "DontCare"]
     write(root / L, "".join(label_text(CAR, kind.upper()).replace("\n", " 0.9\n") for kind in kinds))
     boxes, labels = read_labels(root / L)
     assert [CLASSES[i] for i in labels] == kinds[:-1]
     np.testing.assert_array_equal(boxes, np.repeat(boxes[:1], 8, axis=0))
-    frames = open_frames(root, class_map="nuscenes")
-    assert frames.classes == ("car", "truck", "pedestrian", "bicycle", "bus")
-    found = [frames.classes[i] for i in frames.frame(1).labels]
-    assert found == ["car", "car", "truck", "pedestrian", "pedestrian", "bicycle", "bus"]
 
 
 def test_a_split_determines_the_frames_and_the_sensor_can_be_replaced(root):

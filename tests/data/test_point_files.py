@@ -284,6 +284,10 @@ NO_LAGS = {
     "Unix seconds": (1.5e9 + np.arange(820) / 8192, "got values up to 1.5e+09, which look like Unix time"),
     "Unix nanoseconds": (1.5e18 + np.arange(820), "got values up to 1.5e+18, which look like Unix time"),
     "number of the LiDAR": (np.arange(820) % 2, "got whole numbers up to 1, which look like a ring"),
+    "negative": (
+        np.arange(820) % 4 * -0.05,
+        "got negative values from -0.15 on, expected the time lag",
+    ),
     "milliseconds": (np.arange(820) % 4 * 49.951, "got values up to 149.853, which look like another unit"),
 }
 
@@ -371,7 +375,7 @@ BAD = {
     "nine_columns.npy": (np.zeros((5, 9), np.float32), "got float32 of shape (5, 9), expected"),
     "complex.npy": (np.zeros((5, 4), complex), "got complex128 of shape (5, 4), expected real"),
     "ring.npy": (np.array([[8, 1, -1, 3, 31], [np.nan] * 5]), "fifth column: got whole numbers up to 31, which"),
-    "future.npy": (np.full((5, 5), -0.1, np.float32), "time_lag: got -0.1 in row 0"),
+    "future.npy": (np.column_stack([np.full((20, 4), 5), -0.1 * np.eye(20)[0]]), "time_lag: got -0.1 in row 0"),
     "no_header.pcd": (b"hello\nworld\n", "no DATA line"),
     "form.pcd": (pcd_header("zipped", 1) + b"1 2 3 4", "damaged header: 'zipped'"),
     "short.pcd": (pcd_header("binary", 9) + b"1234", "DATA: truncated: got 4 bytes, expected 144"),

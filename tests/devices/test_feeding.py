@@ -146,7 +146,7 @@ def test_batches_in_shared_memory_of_workers_outlive_it(mesh):
             del each
 
     with (
-        make_batches(ToyFrames(), PLAIN, workers=1, lend=True, **options) as batches,
+        make_batches(ToyFrames(), PLAIN, workers=1, **options) as batches,
         feed(noted(batches), mesh) as stream,
     ):
         fed = [each.batch for each in stream]

@@ -6,13 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusal import refused
-from tiny_run import SENSOR
 
-from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.inference.alignment import Alignment, align
-from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E, TINY, VLP16
-from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.types import Detections
 
 
@@ -71,6 +67,21 @@ def test_files_of_several_sensors_and_wrong_scales_are_refused(tmp_path):
         align(NUSCENES_HDL32E, intensity_scale=-1.0)
 
 
+def test_options_stand_for_the_sensor_of_the_data():
+    """An angle takes the place of the turn between the sensors, and a factor that of their scale."""
+    kitti = [Path("x/training/velodyne/000000.bin")]
+    for options, turn, scale in (
+        ({}, np.pi / 2, 255.0),
+        ({"yaw_rad": 0.0}, 0.0, 255.0),
+        ({"yaw_rad": 0.0, "intensity_scale": 1.0}, 0.0, 1.0),
+        ({"sensor": NUSCENES_HDL32E}, 0.0, 1.0),
+    ):
+        aligned = align(NUSCENES_HDL32E, paths=kitti, **options)
+        pose = np.eye(4) if aligned.pose is None else aligned.pose
+        assert np.arctan2(pose[1, 0], pose[0, 0]) == pytest.approx(turn)
+        assert aligned.data.intensity_scale == scale
+
+
 UNKNOWN = dataclasses.replace(TINY, forward_rad=None)
 FILES = [Path("a.npy")]
 NOT_DECLARED = (
@@ -99,20 +110,3 @@ NOT_ROTATED = (
 def test_a_note_says_if_a_heading_is_unknown(aligned, expected, capsys):
     aligned.tell_notes()
     assert capsys.readouterr().err == expected
-
-
-def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(detector, capsys):
-    frame = make_frame(0, SENSOR)
-    points = np.column_stack([frame.points[:, 1], -frame.points[:, 0], frame.points[:, 2:]])
-    ahead = dataclasses.replace(SENSOR, forward_rad=0.0)
-    [expected], [found] = (
-        list(predict(detector, InMemoryFrames((dataclasses.replace(frame, points=p),), sensor, detector.classes)))
-        for p, sensor in ((frame.points, SENSOR), (points, ahead))
-    )
-    assert capsys.readouterr().err.count("clouds rotated by 90 degrees") == 1
-    valid = np.asarray(expected.detections.valid)
-    assert valid.any()
-    np.testing.assert_array_equal(found.detections.scores, expected.detections.scores)
-    a, b = np.asarray(expected.detections.boxes)[valid], np.asarray(found.detections.boxes)[valid]
-    np.testing.assert_allclose(b[:, :3], np.stack([a[:, 1], -a[:, 0], a[:, 2]], -1), atol=1e-5)
-    np.testing.assert_allclose(b[:, 7:], np.stack([a[:, 8], -a[:, 7]], -1), atol=1e-5)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
+from fcos_lidar_jax.data.box_geometry import to_world
+from fcos_lidar_jax.inference.tracks import Tracks, track
 
 
 def objects(seed, number=60):

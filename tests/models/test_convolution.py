@@ -11,7 +11,7 @@ from commands import run_python
 from jax import export, lax
 
 from fcos_lidar_jax.models import convolution
-from fcos_lidar_jax.models.convolution import convolve
+from fcos_lidar_jax.models.convolution import convolve, pointwise
 
 CASES = {
     "3x3": ((3, 3, 6, 5), {}),
@@ -147,6 +147,12 @@ def test_pointwise_sums_in_the_type_asked_for(dtype):
     assert wide(x, kernel[0, 0]).dtype == jnp.float32
     found = jax.jit(gradients(wide))(x, kernel[0, 0], weights.astype(jnp.float32))
     assert_close([wide(x, kernel[0, 0]), *found], [values, to_x, to_kernel[0, 0]], TOLERANCES[dtype])
+
+
+def test_pointwise_takes_a_symbolic_number_of_pixels():
+    (number,) = export.symbolic_shape("n")
+    shapes = jax.ShapeDtypeStruct((1, number, 1, 4), jnp.float32), jax.ShapeDtypeStruct((4, 20), jnp.float32)
+    assert export.export(jax.jit(pointwise))(*shapes).out_avals[0].shape == (1, number, 1, 20)
 
 
 def test_only_cpu_has_rows_also_in_exported_programs():

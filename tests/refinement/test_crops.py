@@ -12,7 +12,7 @@ from fcos_lidar_jax.refinement import crops
 from fcos_lidar_jax.refinement.crops import crop_points
 
 OPTIONS = {"num_points": 24, "margin_m": 0.5}
-crop = jax.jit(crop_points, static_argnames=("num_points", "margin_m", "limit_m"))
+crop = jax.jit(crop_points, static_argnames=("num_points", "margin_m"))
 
 
 def cloud(seed: int, number: int = 1000):

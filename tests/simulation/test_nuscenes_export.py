@@ -77,7 +77,7 @@ def test_a_sweep_that_was_cut_by_a_full_disk_is_made_again(made, tmp_path, monke
 
     def until_full(file: Path, data: bytes) -> int:
         sizes.append(len(data))
-        if len(sizes) < 15:
+        if len(sizes) < 23:
             return write(file, data)
         write(file, data[:-20])
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -85,7 +85,7 @@ def test_a_sweep_that_was_cut_by_a_full_disk_is_made_again(made, tmp_path, monke
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", until_full)
         assert cli.main(command(tmp_path / "data")) == 1
-    assert len(sizes) == 15
+    assert len(sizes) == 23
     assert contents(synthesize(tmp_path / "data")) == contents(made)
 
 

@@ -129,15 +129,3 @@ def test_porous_solids_stop_rays_according_to_depth():
     assert stopped.mean() == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 4000))
     assert hits.range_m[stopped].min() >= 8 - 1e-3
     assert hits.range_m[stopped].max() <= 12 + 1e-3
-
-
-def test_reachable_includes_occluded_rays():
-    """A post in front of a wall stops rays that would reach the wall."""
-    solids = make_solids(BOX, [[20, 0, 0], [10, 1, 0]], [[0.1, 4, 4], [0.1, 1, 4]], owner=np.array([0, 1]))
-    fan = Fan(np.zeros(1), 400, 0.35, 0.7 / 400, np.zeros(1))
-    hits = cast(fan, np.eye(3), np.zeros(3), solids, FAR_BELOW, np.random.default_rng(0))
-    owners, seen = np.bincount(hits.reachable // 400, minlength=2), (hits.solid == 0).sum()
-    # Numbers of rays. The post hides the wall from straight ahead to its outer edge.
-    wide, behind = 2 * np.arctan2(4, 19.9) / (0.7 / 400), np.arctan2(2, 9.9) / (0.7 / 400)
-    np.testing.assert_allclose(owners, [wide, behind], atol=1.01)
-    assert seen == pytest.approx(wide - behind, abs=1.51)

@@ -96,17 +96,3 @@ def test_fused_frames_are_reproducible_and_annotated_by_the_current_sweep(fast_f
     laser = make_frame(0, ARGOVERSE2, reading=CloudReading(2, "none"))
     assert laser.points.shape[1] == 6
     assert set(np.unique(laser.points[:, 5])) <= set(range(64))
-
-
-def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep(fast_frames):
-    frames = SimulatedFrames(SHORT_RANGE, 3, 5, reading=CloudReading(10), fast_traffic=True)
-    passed = 0
-    for i in range(3):
-        frame, whole = frames.frame(i), fast_frames[5 + i]
-        np.testing.assert_array_equal(frame.boxes, whole.boxes[whole.num_points >= 5])
-        dropped = [(whole.points[:, 4] == lag).sum() - (frame.points[:, 4] == lag).sum() for lag in LAGS]
-        assert 0 < 0.9 * max(dropped) < min(dropped)  # each sweep sees the same ego vehicle
-        close, old = (np.abs(frame.points[:, :2]) < 1).all(axis=1), frame.points[:, 4] > 0
-        assert not (close & ~old).any()
-        passed += (close & old).sum()  # points ahead of the ego vehicle that it has since reached
-    assert passed > 20

@@ -1,12 +1,9 @@
 """A CenterPoint so small that its step compiles in seconds."""
 
 from tiny_run import CONFIG as OURS
-from tiny_run import FRAMES
 
 from fcos_lidar_jax.centerpoint import CenterPointConfig, PillarConfig
 from fcos_lidar_jax.config import ModelConfig
-from fcos_lidar_jax.input_pipeline.loader import make_batches
-from fcos_lidar_jax.types import Batch
 
 CONFIG = CenterPointConfig.of(
     OURS,
@@ -29,8 +26,3 @@ NETWORK_OPTIONS = """
     --pillars.neck-channels 8 --pillars.output-stride 2 --pillars.head-channels 8
 """.split()  # noqa: SIM905
 """Options of ``fcos-lidar train`` that reduce a CenterPoint preset to this network."""
-
-
-def host_batch() -> Batch:
-    with make_batches(FRAMES, CONFIG, seed=0, num_steps=1, first_step=0, threads=0) as stream:
-        return next(stream).batch

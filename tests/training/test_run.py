@@ -21,7 +21,7 @@ from unittest.mock import Mock
 import jax
 import numpy as np
 import pytest
-from commands import contents, cut
+from commands import contents
 from event_files import summaries
 from linear_network import linear_network
 from PIL import Image
@@ -265,15 +265,6 @@ def limits():
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def cut_description(folder: Path) -> None:
-    cut(folder / "checkpoints" / "00000003" / "checkpoint.json", -9)
-
-
-def half_saved(folder: Path) -> None:
-    newest = folder / "checkpoints" / "00000003"
-    newest.rename(newest.with_name(".00000003.abc"))
-
-
 def unrecorded(folder: Path) -> None:
     *kept, last = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
     assert "test/mAP" in last
@@ -301,12 +292,6 @@ EVENTS = {
     # The exit code tells a script that no further run starts.
     "SIGTERM in the last step, and a kill before its evaluation is recorded": Event(
         3, TERM, 143, "00000002 00000004", "resuming after step 4", change=unrecorded
-    ),
-    "a kill while saving": Event(
-        2, TERM, 143, ".00000003.abc 00000002", "resuming after step 2", save=1, change=half_saved
-    ),
-    "a damaged checkpoint": Event(
-        2, TERM, 143, "00000002 00000003", "going back to the checkpoint before", save=1, change=cut_description
     ),
     "a loss that is not finite": Event(
         2, overflowing, 1, "00000001 00000002", "; the last checkpoint is ", save=1
