@@ -54,7 +54,9 @@ def encode(
     offset, velocity = boxes[..., :2] - points[..., :2], boxes[..., 7:9]
     if axes == "ray":
         clockwise = -jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
-        offset, velocity = _turn(offset, *clockwise), _turn(velocity, *clockwise)
+        known = ~jnp.isnan(velocity).any(axis=-1, keepdims=True)
+        turned = _turn(jnp.where(known, velocity, 0.0), *clockwise)  # unknown velocities have no gradient
+        offset, velocity = _turn(offset, *clockwise), jnp.where(known, turned, jnp.nan)
     return jnp.concatenate(
         [
             offset,

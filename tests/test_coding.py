@@ -66,6 +66,10 @@ def test_only_unknown_velocities_encode_to_nan(axes):
     unknown = np.isnan(jitted(encode)(boxes, points, azimuth, axes=axes))
     assert unknown[:3, 8:].all()
     assert unknown.sum() == 6
+    boxes[3, 3:6] = 0  # of no size
+    total = jax.grad(lambda *args: jnp.nansum(encode(*args, axes=axes)), argnums=(0, 1, 2))
+    gradients = jax.jit(total)(*map(jnp.asarray, (boxes, points, azimuth)))
+    assert all(np.isfinite(leaf).all() for leaf in gradients)
 
 
 @both_axes

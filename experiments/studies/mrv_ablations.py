@@ -85,6 +85,7 @@ def _twice(config: Config) -> Config:
 
 TABLE, SMALL = make_table(small=False), make_table(small=True)
 SMALL_WITH_SECOND_LOOK = make_table(small=True, second_look=True)
+LONGER = make_table(small=True, second_look=True, longer=True)
 
 
 def main(args: AblationArgs) -> None:

@@ -4,7 +4,7 @@ import pytest
 
 from experiments.paper_tables.cells import changes_of
 from experiments.paper_tables.scales import quarter, smoke
-from experiments.studies.mrv_ablations import SMALL, SMALL_WITH_SECOND_LOOK, TABLE, make_table
+from experiments.studies.mrv_ablations import LONGER, SMALL, SMALL_WITH_SECOND_LOOK, TABLE
 
 CHANGED = {
     "one round of ten sweeps": "projection.num_rounds=1",
@@ -32,7 +32,7 @@ def test_every_row_changes_the_named_part_only(tmp_path, make_scale, table):
 
 
 def test_a_longer_training_has_twice_the_epochs(tmp_path):
-    base, table = quarter(tmp_path).base, make_table(small=True, second_look=True, longer=True)
-    whole, twice = (row.change(base) for row in table.rows)
+    base = quarter(tmp_path).base
+    whole, twice = (row.change(base) for row in LONGER.rows)
     assert whole == SMALL_WITH_SECOND_LOOK.rows[0].change(base)
     assert changes_of(twice, whole) == f"optimizer.epochs={2 * whole.optimizer.epochs}"

@@ -13,6 +13,8 @@ from tiny_run import SENSOR
 
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference import DetectedBox, DetectedBoxes
+from fcos_lidar_jax.inference.detector import _scaled_once
+from fcos_lidar_jax.sensors import KITTI_HDL64E
 from fcos_lidar_jax.simulation.frames import make_frame
 
 CLASSES = ("car", "traffic<cone>")
@@ -101,3 +103,11 @@ def test_truncated_points_and_clouds_of_another_sensor_are_reported(detector):
         ),
     ):
         detector(points)
+
+
+@pytest.mark.parametrize("factor", [1, 1 / 255])
+def test_intensities_are_scaled_once_also_if_many_points_have_none(factor):
+    points = np.full((1000, 5), 9, np.float32)
+    points[:, 3:], points[:400, 3] = 0, np.linspace(50, 250, 400)
+    found = _scaled_once(points * np.float32([1, 1, 1, factor, 1]), KITTI_HDL64E, 1)
+    np.testing.assert_allclose(found, points, rtol=1e-5)
