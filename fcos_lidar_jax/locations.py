@@ -71,7 +71,7 @@ def image_sensor(sensor: Sensor, model: ModelConfig) -> Sensor:
     """
     if not model.circular_width:
         return sensor
-    if sensor.azimuth_limits_rad is not None:
+    if not sensor.is_full_turn:
         raise ValueError(f"circular_width: got True for sensor {sensor.name!r}, which covers part of a turn")
     return dataclasses.replace(sensor, num_columns=_up_to_stride(sensor.num_columns))
 
@@ -85,8 +85,7 @@ def image_layout(sensor: Sensor, model: ModelConfig) -> ImageLayout:
     (64, 1088, 92820)
     """
     binned = image_sensor(sensor, model)
-    full_turn = sensor.azimuth_limits_rad is None
-    return ImageLayout(binned.num_rows, binned.num_columns, model.row_upscale, full_turn)
+    return ImageLayout(binned.num_rows, binned.num_columns, model.row_upscale, sensor.is_full_turn)
 
 
 def pad_image(features: Float32[Array, "*b h w c r"], layout: ImageLayout) -> Float32[Array, "*b i j c r"]:

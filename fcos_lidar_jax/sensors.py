@@ -77,7 +77,7 @@ class Sensor(Checked):
 
     @property
     def is_full_turn(self) -> bool:
-        """Whether the columns cover all azimuths, also if the limits say so."""
+        """Whether the columns cover all azimuths: without limits, or with limits a turn apart."""
         return self.num_columns * self.column_rad > 2 * math.pi - _ROUNDING_RAD
 
     @property

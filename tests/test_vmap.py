@@ -1,6 +1,6 @@
 """Pure functions are the same for each sample of a batch under ``jit`` and ``vmap`` as for the sample alone.
 
-Functions with batches of their own, such as the projection and NMS, are compared in their own tests.
+The projection, rotated_nms and others are compared in tests of their own.
 """
 
 import functools
@@ -88,7 +88,7 @@ CASES = {
         lambda p, m: remove_close(p, m, tiny_run.SENSOR, CloudReading(1, "all", 1.0)),
         "points mask",
     ),
-    "points_in_box": (lambda p, b: points_in_box(xyz(p), b[0]), "points boxes"),
+    "points_in_box": (lambda p, b: points_in_box(xyz(p)[:, None], b), "points boxes"),
     "spherical": (lambda p: spherical(xyz(p)), "points"),
     "image_columns": (lambda n: image_columns(n, tiny_run.SENSOR), "number"),
     "merge_boxes": (

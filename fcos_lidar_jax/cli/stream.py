@@ -145,7 +145,7 @@ def run(args: Stream, *, in_lines: bool = True) -> None:
             drive.notes.append(line)
     if line := truncation(num_truncated, detector.config):
         tell(line)
-    tell(f"{len(notes)} sweeps in {time.monotonic() - began:.1f} s")
+    tell(f"{len(notes)} sweeps in {time.monotonic() - began:.1f} s, with loading and compiling")
 
 
 def _in_order(drive: Drive) -> Iterator[Sweep]:

@@ -68,8 +68,8 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
             reader was used: close points are then removed here, and the time lags are checked.
 
     Raises:
-        ValueError: wrong number of columns; more time lags than ``config.num_sweeps``; without a reader also rings
-            or Unix times instead of time lags.
+        ValueError: wrong number of columns; more time lags than ``config.num_sweeps``; without a reader also a
+            fifth column of something else, see :func:`~fcos_lidar_jax.data.point_files.check_time_lags`.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -213,7 +213,7 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
 
     Uses the current sweep: the share of points beyond the sensor's limits and outside its vertical field of view,
     points per image cell, the share of points with a neighbour in the next column and in the next row, of rows
-    with points, and the scale of the intensity.
+    with points, the order of the lasers, and the scale of the intensity.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame

@@ -27,7 +27,7 @@ class Frame:
         labels: i32[m]: index into the ``classes`` of the frame set.
         num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box, -1 if unknown.
         num_close: number of points on the ego vehicle that the reader removed, see :func:`drop_close`.
-        others: f32[k, 9]: boxes of other classes, as far as the data have them: nothing is pasted there.
+        others: f32[k, 9]: boxes that a class map left out: nothing is pasted there.
     """
 
     points: np.ndarray

@@ -13,7 +13,6 @@ from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
 from fcos_lidar_jax.fields import check, check_name
 from fcos_lidar_jax.files import expect_file, some_files
-from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
@@ -98,7 +97,6 @@ class KittiFrames(FrameSet):
         boxes = to_lidar(camera_boxes, calibration["velo_to_rect"])
         check_boxes(boxes, lambda i: f"{self._file('calib', name)}: takes box {i} of the labels far away")
         boxes = boxes.astype(np.float32)
-        boxes[:, 6] = wrap_angle(boxes[:, 6])  # the nearest float32 may be below -pi
         points = read_points(self._file("velodyne", name), self.sensor)
         if self.image_size is not None:
             points = points[_in_left_image(points, calibration, self._file("calib", name))]

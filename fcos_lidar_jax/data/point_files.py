@@ -160,17 +160,16 @@ def check_time_lags(lag: np.ndarray, where: Path | str = "points", num_sweeps: i
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
     if not lag.size:
         return
-    most, few = f"up to {lag.max():g}", lag.size / 10  # a few may be damage
-    found = None
-    if np.count_nonzero(lag < 0) > few:
-        found = f"negative values from {lag.min():g} on"
-    elif np.count_nonzero(lag > MAX_TIME_LAG_S) > few:
-        found = f"values {most}, which look like {'Unix time' if np.median(lag) >= _UNIX_S else 'another unit'}"
-    elif lag.max() >= 1 and not (lag % 1).any():
-        found = f"whole numbers {most}, which look like a ring"
-    if found:
+    least, most = float(lag.min()), float(lag.max())
+    is_unix = most >= _UNIX_S and np.median(lag) >= _UNIX_S  # a few may be damage
+    if is_unix or (most > 1 and not (lag % 1).any()):
+        kind = "values" if is_unix else "whole numbers"
+        found = f"{kind} up to {most:g}, which look like {'Unix time' if is_unix else 'a ring'}"
         expected = "the time lag in seconds: leave the column out, or put 0 into it and a ring into a sixth"
         raise ValueError(f"{where}: fifth column: got {found}, expected {expected}")
+    if np.count_nonzero((lag < 0) | (lag > MAX_TIME_LAG_S)) > lag.size / 10:
+        expected = "the age of each sweep in seconds, 0 for the current one"
+        raise ValueError(f"{where}: fifth column: got values from {least:g} to {most:g}, expected {expected}")
     check_num_lags(lag, where, num_sweeps)
 
 

@@ -84,9 +84,10 @@ class CloudDetector(abc.ABC):
 
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
-                in metres, intensity, time lag in seconds, laser number, as in an array file. The sensor scales
-                intensities unless most would exceed 255, as in points of frames, which are already scaled. Under
-                ``jax.jit``, call the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
+                in metres, intensity, time lag in seconds, laser number (from the highest laser down), as in an
+                array file. The sensor scales intensities unless most of them, without zeros, would exceed 255, as
+                in points of frames, which are already scaled. Under ``jax.jit``, call the function of
+                :func:`~fcos_lidar_jax.inference.make_detect` instead.
             sensor: sensor that recorded the points, or its name or JSON file; gives their heading, position and
                 intensity scale. By default the detector's or, for files in the folders of KITTI, Argoverse 2 and
                 own data with ``sensor.json``, theirs.
@@ -138,10 +139,8 @@ def _scaled_once(points: Rows, sensor: Sensor, num_sweeps: int) -> np.ndarray:
     if sensor.intensity_scale == 1:
         return rows
     if np.count_nonzero(rows[:, 3] > 255) > np.count_nonzero(rows[:, 3] > 0) / 2:
-        tell(
-            "note: intensities are not scaled, since most would exceed 255: they seem to be scaled already",
-            once=True,
-        )
+        seem = "most would exceed 255: they seem to be scaled already"
+        tell(f"note: intensities are not scaled, since of those above 0 {seem}", once=True)
         return points_from_array(points, dataclasses.replace(sensor, intensity_scale=1.0))
     return rows
 

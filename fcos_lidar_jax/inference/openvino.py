@@ -27,7 +27,7 @@ _HINT = {"float32": "f32", "bfloat16": "bf16"}
 class OpenVinoDetector(TrainedDetector):
     """A :class:`TrainedDetector` whose network runs in OpenVINO, see :func:`with_openvino`."""
 
-    precision: Precision  # precision of the network
+    precision: Precision  # precision of the convolutions
     network: Callable[[RangeImage], Outputs]  # for one sample
 
     @property

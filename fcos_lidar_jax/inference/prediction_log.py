@@ -68,7 +68,7 @@ def write_predictions(
             if jax.process_index() == 0:
                 log = held.enter_context(_open_log(path, _fingerprint(detector, frames, *same, options)))
                 finished = _Finished(log, frames, names, unit)
-        check_same(detections_fingerprint(detector, names, *same), "detector, frames or batch size")
+        check_same(detections_fingerprint(detector, names, *same), "versions, detector, frames or batch size")
         todo = np.ones(len(names), bool) if finished is None else finished.todo
         how["indices"] = np.flatnonzero(multihost_utils.broadcast_one_to_all(todo)).tolist()
         for number, prediction in enumerate(predict(detector, frames, **how), 1):

@@ -18,9 +18,10 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
     """Make the function that samples objects for a frame.
 
     For each class in order, samples without replacement as many objects as the frame lacks, counting the frame's
-    boxes with at least one point. An object that overlaps a box of the frame, also of another class, or an object
-    pasted before is dropped and not replaced. Objects match by class name and need ``min_points`` points to paste,
-    at least one of them from the current sweep; a model of k sweeps gets the points of the newest k sweeps.
+    boxes with at least one point. An object that overlaps a box of the frame, also one that a class map left out,
+    or an object pasted before is dropped and not replaced. Objects match by class name and need ``min_points``
+    points to paste, at least one of them from the current sweep; a model of k sweeps gets the points of the newest
+    k sweeps.
 
     Returns:
         ``(frame, rng) -> (pasted, removed)``: the objects, with their numbers of points of the current sweep, and

@@ -209,7 +209,7 @@ def _leave_signals(worker: int, workers: int) -> None:
 def _check_shared_memory(config: Config, workers: int, num_processes: int) -> None:
     """Refuse too little shared memory, which would kill workers silently; containers often have 64 MiB."""
     row = config.max_points * (4 * _MAX_COLUMNS + 1) + config.max_boxes * 41
-    # Each worker has one batch waiting and one in progress; one more is being copied.
+    # Each worker has one batch waiting and one in progress; one more is being transferred.
     needed = (2 * workers + 1) * row * config.optimizer.batch_size // num_processes
     folder = Path("/dev/shm")
     free = shutil.disk_usage(folder).free if folder.is_dir() else needed

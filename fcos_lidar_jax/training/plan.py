@@ -269,7 +269,7 @@ def _initial_weights(
     check_arrays(folder, shapes, variables, whose=whose)
     own, new = map(config_to_json, (checkpoint.config, detector.config))
     shared = {field.name for field in dataclasses.fields(Config)} - {"model"}
-    for part in sorted(own.keys() - shared):  # of the network, also of another detector's
+    for part in sorted(own.keys() - shared):  # `model`, and fields that only another detector has
         for name, was, now in _differences(own[part], new[part], part):
             tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
     for line in _sensor_differences(checkpoint.sensor, detector.sensor):

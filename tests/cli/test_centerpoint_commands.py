@@ -50,6 +50,7 @@ def test_checkpoint_and_exported_file_hold_the_detector(home):
     exported = fcos.load_detector(home / "detector.fcos")
     assert exported.config == trained.config
     by_file, by_weights = (d(home / "cloud.npy") for d in (exported, trained))
+    assert len(by_weights) > 0
     for name in ("boxes", "scores", "labels"):  # bit-identical with compiler optimisation
         np.testing.assert_allclose(getattr(by_file, name), getattr(by_weights, name), atol=1e-4)
 

@@ -115,7 +115,9 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
         [evaluated] = json.loads((tmp_path / f"scores{more}" / "detections.json").read_text())["frames"]
         assert evaluated["boxes"] == expected
     assert 0 < len(cropped) < len(boxes)
-    assert detect(tmp_path / "a.json", kitti / "elsewhere" / "cloud.bin", "--data-sensor kitti_hdl64e") == boxes
+    copy = kitti / "elsewhere" / "cloud.bin"
+    assert detect(tmp_path / "a.json", copy, "--data-sensor kitti_hdl64e") == boxes
+    assert stream(tmp_path / "a.jsonl", copy, "--yaw-deg 90 --intensity-scale 255") == boxes
 
     detector = fcos.load_detector("small")
     with warnings.catch_warnings():

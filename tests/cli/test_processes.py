@@ -178,7 +178,7 @@ def test_processes_with_different_detectors_are_refused(root, tmp_path):
         changed = jax.tree.map(lambda leaf: leaf + 1, untrained(CONFIG, SENSOR))
         save_checkpoint(other, Checkpoint(CONFIG, SENSOR, changed, 1))
     both = [evaluate(root, tmp_path / "both", *which) for which in (linear(root), ["--checkpoint", str(other)])]
-    line = "process 1: detector, frames or batch size: different from process 0, expected the same"
+    line = "process 1: versions, detector, frames or batch size: different from process 0, expected the same"
     for code, _, errors in ended(start_two("coordinator", *both, before=(use, use))):
         assert (code, error_lines(errors)) == (1, [f"fcos-lidar: error: {line}"])
 

@@ -73,7 +73,7 @@ def test_boxes_equal_detect_with_the_same_sweeps(home, tmp_path, capsys):
     lines = stream(home, tmp_path / "boxes.jsonl", home / "drive", "--poses", home / "poses.json")
     told = capsys.readouterr().err
     assert told.count("compiling the detector") == 1
-    assert re.search(r"^5 sweeps in \d+\.\d s$", told, re.MULTILINE)
+    assert re.search(r"^5 sweeps in \d+\.\d s, ", told, re.MULTILINE)
     listed = json.loads((home / "poses.json").read_text())
     assert len(lines) == SWEEPS
     for index, line in enumerate(lines):

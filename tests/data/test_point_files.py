@@ -283,12 +283,8 @@ NO_LAGS = {
     "ring": (np.arange(820) % 16, "got whole numbers up to 15, which look like a ring"),
     "Unix seconds": (1.5e9 + np.arange(820) / 8192, "got values up to 1.5e+09, which look like Unix time"),
     "Unix nanoseconds": (1.5e18 + np.arange(820), "got values up to 1.5e+18, which look like Unix time"),
-    "number of the LiDAR": (np.arange(820) % 2, "got whole numbers up to 1, which look like a ring"),
-    "negative": (
-        np.arange(820) % 4 * -0.05,
-        "got negative values from -0.15 on, expected the time lag",
-    ),
-    "milliseconds": (np.arange(820) % 4 * 49.951, "got values up to 149.853, which look like another unit"),
+    "negative": (np.arange(820) % 4 * -0.05, "got values from -0.15 to -0, expected the age of each sweep"),
+    "milliseconds": (np.arange(820) % 4 * 49.951, "got values from 0 to 149.853, expected the age of each sweep"),
 }
 
 

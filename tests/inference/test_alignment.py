@@ -9,6 +9,7 @@ from refusal import refused
 
 from fcos_lidar_jax.inference.alignment import Alignment, align
 from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E, TINY, VLP16
+from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.types import Detections
 
 
@@ -65,6 +66,13 @@ def test_files_of_several_sensors_and_wrong_scales_are_refused(tmp_path):
         align(NUSCENES_HDL32E, paths=[kitti, other])
     with refused("intensity_scale: got -1.0, expected within (0, 1e+09]"):
         align(NUSCENES_HDL32E, intensity_scale=-1.0)
+
+
+def test_clouds_of_another_sensor_are_announced(capsys):
+    Alignment(TINY, NUSCENES_HDL32E).announce(make_frame(0, TINY).points)
+    assert "warning: points do not fit sensor 'nuscenes_hdl32e'" in capsys.readouterr().err
+    Alignment(TINY, TINY).announce(make_frame(0, TINY).points)
+    assert "warning" not in capsys.readouterr().err
 
 
 def test_options_stand_for_the_sensor_of_the_data():
