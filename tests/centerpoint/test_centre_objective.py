@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_peer import CONFIG
-from tiny_run import SENSOR, untrained
+from tiny_run import SENSOR, host_batch, untrained
 
 from fcos_lidar_jax.centerpoint.centres import centre_targets, decode_centres, encode_centres, focal_loss
 from fcos_lidar_jax.centerpoint.objective import make_sums, sample_losses

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from commands import page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
+from metrics_oracle import leaves
 from tiny_run import save_untrained
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
