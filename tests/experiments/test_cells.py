@@ -32,7 +32,7 @@ def test_committed_tables_are_those_of_their_cells_and_of_the_rows_of_today(tmp_
     assert len(cells) == len((SECTOR / "cells.csv").read_text().splitlines()) - 1 > 20
     assert {name for name, _ in cells} <= {*changes.values()}
     files = sorted(SECTOR.glob("*.md"))
-    assert len(files) == 7
+    assert len(files) == 8
     for file in files:
         record = json.loads(file.with_suffix(".json").read_text())
         table = tables[record["table"]].only(tuple(row["label"] for row in record["rows"]))
