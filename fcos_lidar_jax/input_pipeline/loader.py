@@ -158,7 +158,8 @@ def make_batches(
         fade_step=num_steps - config.fade_epochs * -(-order.epoch_size // size),
         paste=make_paste(objects, config) if objects is not None and config.copy_paste is not None else None,
     )
-    with contextlib.closing(_prepared(batch_of, first_step, num_steps, threads, workers)) as batches:
+    prepared = _prepared(batch_of, first_step, num_steps, threads, workers)
+    with contextlib.closing(prepared), contextlib.closing(_LetGo(prepared)) as batches:
         yield batches
 
 
@@ -218,3 +219,22 @@ def _check_shared_memory(config: Config, workers: int, num_processes: int) -> No
             f"workers: got {workers}, for which {folder} has {free >> 20} MiB free, expected {needed >> 20} MiB; "
             f"threads need no shared memory"
         )
+
+
+class _LetGo:
+    """An iterator that lets go of grain's when it is closed, because grain's complains if it lives until the exit.
+
+    Not a generator, because it is closed while a thread may still be waiting in it for a batch.
+    """
+
+    def __init__(self, batches: Iterator[HostBatch]) -> None:
+        self._batches = batches
+
+    def __iter__(self) -> Iterator[HostBatch]:
+        return self
+
+    def __next__(self) -> HostBatch:
+        return next(self._batches)
+
+    def close(self) -> None:
+        self._batches = iter(())

@@ -118,7 +118,7 @@ def test_keyframes_skip_the_boxes_of_other_sweeps_and_are_called_by_their_tokens
     capsys.readouterr()
     command("stream", data, "--keyframes --out", tmp_path / "some.jsonl")
     told = capsys.readouterr().err
-    assert "3 sweeps: " in told
+    assert "3 sweeps in " in told
     assert re.search(r"^sweeps 1  \S+: \d+ boxes$", told, re.MULTILINE)
     every, some = (tmp_path / f"{name}.jsonl" for name in ("all", "some"))
     lines = some.read_text().splitlines()
