@@ -267,11 +267,12 @@ def _initial_weights(
     if not same:
         variables = _for_other_classes(folder, classes, variables, detector, seed)
     check_arrays(folder, shapes, variables, whose=whose)
-    own, new = map(config_to_json, (checkpoint.config, detector.config))
-    shared = {field.name for field in dataclasses.fields(Config)} - {"model"}
-    for part in sorted(own.keys() - shared):  # `model`, and fields that only another detector has
-        for name, was, now in _differences(own[part], new[part], part):
-            tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
+    # What describes the network: `model`, and fields that only another detector's configuration has.
+    others = {field.name for field in dataclasses.fields(Config)} - {"model"}
+    configs = map(config_to_json, (checkpoint.config, detector.config))
+    own, new = ({name: value for name, value in config.items() if name not in others} for config in configs)
+    for name, was, now in _differences(own, new):
+        tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
     for line in _sensor_differences(checkpoint.sensor, detector.sensor):
         tell(f"warning: {folder}: weights trained {line}: expect scores to fall at first")
     return variables
