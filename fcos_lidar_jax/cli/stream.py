@@ -15,7 +15,7 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import Excludes, Needs, Or, Output, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.sinks import check_results, closing_at_failure, open_sinks
-from fcos_lidar_jax.data.box_geometry import to_world
+from fcos_lidar_jax.data.box_geometry import transform_boxes
 from fcos_lidar_jax.data.cloud_policy import truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
@@ -173,7 +173,7 @@ def _tracker(classes: tuple[str, ...]) -> Callable[[list[dict[str, Any]], Sweep]
         nonlocal tracks, before_us
         boxes, labels, scores = read_boxes({"boxes": records}, classes)
         dt = 0.0 if before_us is None else (sweep.time_us - before_us) / 1e6
-        tracks, ids = track(tracks, to_world(boxes, sweep.sensor_to_world), labels, scores, dt)
+        tracks, ids = track(tracks, transform_boxes(boxes, sweep.sensor_to_world), labels, scores, dt)
         before_us = sweep.time_us
         for record, number in zip(records, ids.tolist(), strict=True):
             record["track"] = number

@@ -120,16 +120,16 @@ def _near_boxes(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> n
     return np.flatnonzero(occupied.ravel().take(cells[0] * np.int32(shape[1]) + cells[1]))
 
 
-def to_world(boxes: np.ndarray, sensor_to_world: np.ndarray) -> np.ndarray:
-    """Transform boxes f32[m, 9] from the frame of a sensor to the world, f64[m, 9]; ignores the tilt of headings.
+def transform_boxes(boxes: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Transform boxes f32[m, 9] by a pose f64[4, 4] to f64[m, 9]; ignores the tilt of headings.
 
     >>> quarter = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    >>> to_world(np.array([[10.0, 0, 0, 4, 2, 1, 0, 8, 0]]), quarter).round(4).tolist()
+    >>> transform_boxes(np.array([[10.0, 0, 0, 4, 2, 1, 0, 8, 0]]), quarter).round(4).tolist()
     [[5.0, 10.0, 0.0, 4.0, 2.0, 1.0, 1.5708, 0.0, 8.0]]
     """
-    world, turn = np.array(boxes, np.float64), sensor_to_world[:3, :3]
-    world[:, :3] = world[:, :3] @ turn.T + sensor_to_world[:3, 3]
+    moved, turn = np.array(boxes, np.float64), pose[:3, :3]
+    moved[:, :3] = moved[:, :3] @ turn.T + pose[:3, 3]
     heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=-1) @ turn[:2, :2].T
-    world[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
-    world[:, 7:9] = world[:, 7:9] @ turn[:2, :2].T
-    return world
+    moved[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
+    moved[:, 7:9] = moved[:, 7:9] @ turn[:2, :2].T
+    return moved

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from fcos_lidar_jax.data.box_geometry import to_world
+from fcos_lidar_jax.data.box_geometry import transform_boxes
 from fcos_lidar_jax.evaluation.boxes import BoxColumns
 from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation
 from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
@@ -62,7 +62,7 @@ def sensor_boxes(
 
     def local(boxes: BoxColumns) -> np.ndarray:
         columns = boxes.translation, boxes.size[:, [1, 0, 2]], boxes.yaw, boxes.velocity
-        return to_world(np.column_stack(columns), from_global)
+        return transform_boxes(np.column_stack(columns), from_global)
 
     found, truth = evaluation.predictions, evaluation.truth
     found = found.take((found.sample == sample) & (found.score >= min_score))

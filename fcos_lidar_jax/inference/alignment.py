@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcos_lidar_jax.data.box_geometry import to_world
+from fcos_lidar_jax.data.box_geometry import transform_boxes
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.folder import sensor_file
 from fcos_lidar_jax.data.recorded import check_scale, recorded_by
@@ -60,7 +60,7 @@ class Alignment:
         if (pose := self.inverse.pose) is None:
             return detections
         boxes, valid = np.array(detections.boxes), np.asarray(detections.valid)
-        boxes[valid] = to_world(boxes[valid], pose)
+        boxes[valid] = transform_boxes(boxes[valid], pose)
         boxes[valid, 6] = wrap_angle(boxes[valid, 6])  # rounding to float32 can give pi
         return dataclasses.replace(detections, boxes=boxes)
 

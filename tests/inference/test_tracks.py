@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.data.box_geometry import to_world
+from fcos_lidar_jax.data.box_geometry import transform_boxes
 from fcos_lidar_jax.inference.tracks import Tracks, track
 
 
@@ -82,7 +82,7 @@ def test_positions_headings_and_velocities_are_transformed_to_the_world():
     boxes = rng.normal(0, 10, (20, 9))
     pose = np.eye(4)
     pose[:2, :2], pose[:3, 3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], (5, -3, 1)
-    world = to_world(boxes, pose)
+    world = transform_boxes(boxes, pose)
     for before, after in zip(boxes, world, strict=True):
         for reach in (0.0, 1.0):  # the centre, and a point ahead of it
             point = before[:3] + reach * np.array([np.cos(before[6]), np.sin(before[6]), 0])
